@@ -29,7 +29,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import ROUND
 from musculoskeletal_ae.importing.convert import check_verdict, import_robot, read_source
-from musculoskeletal_ae.importing.source import Comparison, Source, compare, refuse
+from musculoskeletal_ae.importing.source import Comparison, Source, compare
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
@@ -49,7 +49,7 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
     name [m], each (N,). Muscles that wrap are left out.
     """
     urdf = file.with_name('model.urdf')
-    tree, root = (parse_xml(each, read_text(each, refuse)) for each in (urdf, file))
+    tree, root = (parse_xml(each, read_text(each)) for each in (urdf, file))
     settings = ET.SubElement(ET.SubElement(tree, 'mujoco'), 'compiler')
     settings.attrib.update(fusestatic='false', discardvisual='true')
     centres = {}

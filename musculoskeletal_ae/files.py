@@ -2,7 +2,8 @@
 """Read files that a user names, write files atomically, and lock directories.
 
 A file of a user is read only if it is a regular file up to a size limit. The functions that read
-such files have an argument `refuse(file, problem)`, which returns the exception to raise.
+such files have an argument `refuse(file, problem)`, which returns the exception to raise; by
+default, it is that of `file_error`.
 """
 
 import csv
@@ -18,6 +19,8 @@ from typing import Any, BinaryIO, TextIO, TypeVar
 import msgspec
 import yaml
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
 T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
@@ -31,7 +34,12 @@ DEEPEST = 50  # refuse a YAML file that is nested more deeply than this number o
 _Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
-def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
+def file_error(file: Path, problem: str) -> MusculoskeletalError:
+    """Return the usual error for a file, whose text names the file and the problem."""
+    return MusculoskeletalError(f'{file}: {problem}')
+
+
+def open_regular(file: Path, refuse: Refuse = file_error) -> BinaryIO:
     """Open a regular file for reading.
 
     Other files are refused, because reading a pipe could block and a device may never end.
@@ -46,7 +54,7 @@ def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
         raise refuse(file, f'cannot be read: {error}') from error
 
 
-def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
+def read_bytes(file: Path, refuse: Refuse = file_error, largest: int = LARGEST) -> bytes:
     """Return the content of a regular file of at most `largest` bytes.
 
     If the file is larger or cannot be read, the exception of `refuse` is raised.
@@ -61,7 +69,7 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
     return data
 
 
-def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
+def read_text(file: Path, refuse: Refuse = file_error, largest: int = LARGEST) -> str:
     """Return the text of a UTF-8 file of at most `largest` bytes, without a byte-order mark.
 
     If the file is larger, is not UTF-8, or cannot be read, the exception of `refuse` is raised.
@@ -73,7 +81,7 @@ def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
         raise refuse(file, f'is not UTF-8 text (byte {error.start})') from error
 
 
-def read_yaml(file: Path, refuse: Refuse) -> Any:
+def read_yaml(file: Path, refuse: Refuse = file_error) -> Any:
     """Return the content of a YAML file, parsed and checked by `parse_yaml`."""
     text = read_text(file, refuse, LARGEST_YAML)
     try:
@@ -83,7 +91,7 @@ def read_yaml(file: Path, refuse: Refuse) -> Any:
 
 
 def read_csv(
-    file: Path, columns: Sequence[str], refuse: Refuse
+    file: Path, columns: Sequence[str], refuse: Refuse = file_error
 ) -> list[tuple[int, str, list[str]]]:
     """Return (line number, line, cells) of each row below the header of a CSV table.
 
@@ -184,7 +192,7 @@ def _check(text: str) -> None:
 
 
 @contextmanager
-def new_directory(directory: Path, refuse: Refuse) -> Iterator[None]:
+def new_directory(directory: Path, refuse: Refuse = file_error) -> Iterator[None]:
     """Create a directory into which a `with` block writes files; an empty one may exist already.
 
     After an error or Ctrl-C, the files are removed again, and the directory if it was new, so that

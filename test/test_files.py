@@ -8,7 +8,7 @@ import yaml
 
 from musculoskeletal_ae import files
 from musculoskeletal_ae.design.checks import read_declared_actions
-from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import load_description
 from musculoskeletal_ae.tools import fit_series_elastic
 
@@ -82,12 +82,12 @@ def test_an_unreadable_file_of_a_robot_is_named(name, tmp_path):
     file = copy_robot('arm26', tmp_path) / name
     file.unlink(missing_ok=True)
     folder(file)
-    with pytest.raises(RobotDescriptionError, match=name):
+    with pytest.raises(MusculoskeletalError, match=name):
         read_declared_actions(load_description(file.parent))
 
 
 def test_an_unreadable_testbed_table_is_named(tmp_path):
-    with pytest.raises(RobotDescriptionError, match=r'table\.csv'):
+    with pytest.raises(MusculoskeletalError, match=r'table\.csv'):
         fit_series_elastic.read_table(tmp_path / 'table.csv')
 
 

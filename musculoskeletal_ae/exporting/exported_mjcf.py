@@ -32,7 +32,7 @@ from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting.learned_routes import learned_routes
 from musculoskeletal_ae.exporting.user_file import UserFile
-from musculoskeletal_ae.files import new_directory
+from musculoskeletal_ae.files import file_error, new_directory
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
@@ -126,20 +126,16 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
         MusculoskeletalError: If the file is not that of the robot, the directory is not empty, or
             MuJoCo does not load the result.
     """
-
-    def refuse(where: Path, problem: str) -> MusculoskeletalError:
-        return MusculoskeletalError(f'{where}: {problem}')
-
     user = UserFile(file)
     sites = user.sites_of(robot)
     if not any(chain(*sites)):
-        raise refuse(
+        raise file_error(
             file,
             f'it has no tendon with the name and the sites of a muscle of '
             f'{robot.description.directory}; import this file again, because the robot was '
             'imported from another version of it, or its muscles were renamed',
         )
-    with new_directory(out, refuse):
+    with new_directory(out):
         robot = robot.with_elasticity(mae.elasticity)
         body = CalibratedBody(robot)
         fit_to_network(body, mae, seed, with_remainder=False)
@@ -184,11 +180,7 @@ def export(robot: Robot, mae: Mae, out: Path) -> ExportReport:
     Raises:
         MusculoskeletalError: If the directory is not empty, or MuJoCo does not load the model.
     """
-
-    def refuse(file: Path, problem: str) -> MusculoskeletalError:
-        return MusculoskeletalError(f'{file}: {problem}')
-
-    with new_directory(out, refuse):
+    with new_directory(out):
         return _write(robot, mae, out)
 
 

@@ -17,14 +17,13 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.files import read_text, read_yaml
+from musculoskeletal_ae.files import file_error, read_text, read_yaml
 from musculoskeletal_ae.importing.source import (
     KINDS,
     Source,
     distinct,
     link_inertia,
     numbers,
-    refuse,
     safe_name,
     unique,
 )
@@ -46,11 +45,12 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
     limits = _read_limits(limits_file)
     for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
         if os.path.lexists(beside := file.parent / model):
-            tree = parse_xml(beside, read_text(beside, refuse))
+            tree = parse_xml(beside, read_text(beside))
             source, centres = read(beside, tree, (limits, limits_file.name))
             break
     else:
-        raise refuse(file, 'the directory of this file contains neither model.urdf nor model.sdf')
+        problem = 'the directory of this file contains neither model.urdf nor model.sdf'
+        raise file_error(file, problem)
     if limits:
         known = [name for name in limits if source.model.existJointName(name)]
         source.note(
@@ -72,7 +72,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
         route: list[RoutePoint | Wrap] = []
         for part in muscle.findall('link'):
             if (link := part.get('name', '')) not in centres:
-                raise refuse(
+                raise file_error(
                     file, f'muscle {name}: unknown link {link!r}; links: {", ".join(centres)}'
                 )
             body = link if link in source.links else source.links[0]
@@ -116,17 +116,17 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
     """Read the limits of joints in a joint_limits.yaml; {} if there is no such file."""
     if not os.path.lexists(file):
         return {}
-    document, limits = read_yaml(file, refuse), dict[str, tuple[float, float]]()
+    document, limits = read_yaml(file), dict[str, tuple[float, float]]()
     expected = 'expected a list of at least 2 different finite numbers [rad] for each joint'
     if not isinstance(document, dict):
-        raise refuse(file, f'{expected}, got {str(document)[:60]!r}')
+        raise file_error(file, f'{expected}, got {str(document)[:60]!r}')
     for name, values in document.items():
         try:
             span = np.array(values, dtype=float).ravel()
         except (TypeError, ValueError):
             span = np.zeros(0)
         if not span.size or not (np.abs(span) <= 1e6).all() or span.min() == span.max():
-            raise refuse(file, f'joint {str(name)[:60]}: {expected}, got {str(values)[:60]}')
+            raise file_error(file, f'joint {str(name)[:60]}: {expected}, got {str(values)[:60]}')
         limits[str(name)] = float(span.min()), float(span.max())
     return limits
 
@@ -211,7 +211,7 @@ def _read_urdf(
     source.couplings = read_mimics(root)
     names = {joint.get('name') for joint in root.findall('joint')}
     if lost := [c.master for c in source.couplings.values() if c.master not in names]:
-        raise refuse(file, f'a joint mimics {lost[0]!r}, but there is no such joint')
+        raise file_error(file, f'a joint mimics {lost[0]!r}, but there is no such joint')
     origins = {e.get('name', ''): e.find('inertial/origin') for e in root.findall('link')}
     centres = {n: '0 0 0' if e is None else e.get('xyz', '0 0 0') for n, e in origins.items()}
     return source, {name: numbers(xyz, 3, f'link {name}') for name, xyz in centres.items()}
@@ -226,9 +226,10 @@ def _read_sdf(
     """
     model = root.find('.//model')
     if root.tag != 'sdf' or model is None:
-        raise refuse(file, 'expected an <sdf> element with a <model>')
+        raise file_error(file, 'expected an <sdf> element with a <model>')
     if len([*root.iter('model')]) > 1 or model.find('include') is not None:
-        raise refuse(file, 'expected a single <model> without <include>; merge all models into one')
+        problem = 'expected a single <model> without <include>; merge all models into one'
+        raise file_error(file, problem)
     version = [int(part) for part in root.get('version', '1.6').split('.')]
     # Before SDF 1.5, axes were given in the frame of the model. Since then, they are given in the
     # frame of the joint.
@@ -238,7 +239,7 @@ def _read_sdf(
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
             problem = f'{element.tag} with {element.attrib}: only SDF 1.6 is supported'
-            raise refuse(
+            raise file_error(
                 file, f'{problem}, with angles in radians, and without {", ".join(FRAMES)}'
             )
 
@@ -265,7 +266,8 @@ def _read_sdf(
             order += [child for child, parent in above.items() if parent == name]
     if set(order) != set(links) or not above.keys() <= links.keys():
         lost = sorted({*above, *above.values(), *links} - {'world'} - set(order)) or order
-        raise refuse(file, f'expected a tree of links with one root; outside it: {", ".join(lost)}')
+        problem = f'expected a tree of links with one root; outside it: {", ".join(lost)}'
+        raise file_error(file, problem)
     source.above = above
     #: for each link, the index of the joint that carries it, and the joint's pose in the model
     stands: dict[str, tuple[int, pin.SE3]] = {}

@@ -12,7 +12,7 @@ from musculoskeletal_ae.design.checks import RobotCheck, check_robot
 from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.design.route_jumps import jump_choices
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.files import new_directory, read_text
+from musculoskeletal_ae.files import file_error, new_directory, read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.held_range import held_ranges
 from musculoskeletal_ae.importing.mjcf import read_mjcf
@@ -23,7 +23,6 @@ from musculoskeletal_ae.importing.source import (
     Source,
     compare,
     cut,
-    refuse,
     write,
 )
 from musculoskeletal_ae.options import chain_of
@@ -57,14 +56,14 @@ def read_source(file: Path) -> Source:
     """Read the robot of a file of any supported format, which the root element identifies.
 
     Raises:
-        SourceError: If the file is not valid; the message names the file, the problem and the legal
-            values.
+        MusculoskeletalError: If the file is not valid; the message names the file, the problem and
+            the legal values.
         RobotDescriptionError: If the file cannot be read as XML, or if a URDF is not valid.
     """
-    text = read_text(file, refuse, LARGEST)
+    text = read_text(file, largest=LARGEST)
     # Look for OpenSim before parsing, because some of its files are not valid XML.
     if '<OpenSimDocument' in text:
-        raise refuse(file, OPENSIM)
+        raise file_error(file, OPENSIM)
     try:
         root = parse_xml(file, text)
     except RobotDescriptionError as error:
@@ -76,15 +75,15 @@ def read_source(file: Path) -> Source:
     if root.tag not in READERS:
         problem = f'the root element {root.tag[:60]!r} is unknown; legal: {", ".join(READERS)}'
         remedy = 'to import an SDF, pass the path of the cardsflow.xml in its directory instead'
-        raise refuse(file, f'{problem}; {remedy}')
+        raise file_error(file, f'{problem}; {remedy}')
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as e:
         problem = str(e) if isinstance(e, ValueError) else repr(e)
-        raise refuse(file, f'cannot be imported: {problem}') from e
+        raise file_error(file, f'cannot be imported: {problem}') from e
     if not source.routes:
-        raise refuse(file, '; '.join(['has no muscle with a route', *source.lost()[-3:]]))
+        raise file_error(file, '; '.join(['has no muscle with a route', *source.lost()[-3:]]))
     return source
 
 
@@ -97,15 +96,15 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
         chain: Options of `cut`.
 
     Raises:
-        SourceError: If the file cannot be imported.
+        MusculoskeletalError: If the file cannot be imported.
         RobotDescriptionError: If the result is not a valid robot, for example because an inertia is
             not physical.
     """
     source = read_source(file)
     cut(source, **chain)
     if not source.routes:
-        raise refuse(file, '; '.join(['no muscle remains', *source.lost()[-3:]]))
-    with new_directory(out, refuse):
+        raise file_error(file, '; '.join(['no muscle remains', *source.lost()[-3:]]))
+    with new_directory(out):
         notes = list(source.notes)
         write(source, out)
         robot = Robot.load(out)

@@ -26,6 +26,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.files import file_error
 from musculoskeletal_ae.importing.adapted_mjcf import AdaptedModel
 from musculoskeletal_ae.importing.source import (
     PassiveTendon,
@@ -33,7 +34,6 @@ from musculoskeletal_ae.importing.source import (
     Spring,
     distinct,
     names_of_all,
-    refuse,
     safe_name,
     tip_name,
 )
@@ -60,12 +60,12 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
     """Read the robot of an MJCF file, whose root element is `root`.
 
     Raises:
-        SourceError: If MuJoCo cannot load the file.
+        MusculoskeletalError: If MuJoCo cannot load the file.
     """
     for item in root.iter('include'):
         included = file.parent / (name := item.get('file', ''))
         if included.exists() and not included.is_file():
-            raise refuse(file, f'the included file {name!r} is not a regular file')
+            raise file_error(file, f'the included file {name!r} is not a regular file')
     warnings: list[str] = []
     # By default, MuJoCo writes warnings to a file in the working directory.
     mujoco.set_mju_user_warning(warnings.append)
@@ -74,7 +74,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
         spec.compiler.fusestatic = False  # do not merge bodies without joints: each becomes a link
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise refuse(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error
+        raise file_error(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error
     finally:
         mujoco.set_mju_user_warning(lambda _: None)
     reader = _Reader(model, file.stem)
@@ -86,7 +86,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
             mujoco.MjModel.from_xml_string(text)
         except (ValueError, LookupError, mujoco.FatalError) as error:
             problem = f'cannot be adapted to the robot: {" ".join(str(error).split())}'
-            raise refuse(file, problem) from error
+            raise file_error(file, problem) from error
         return text
 
     source.adapted = adapted

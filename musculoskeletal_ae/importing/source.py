@@ -60,15 +60,6 @@ UNLIMITED = {False: np.pi, True: 0.5}
 Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
-class SourceError(MusculoskeletalError):
-    """A file cannot be imported; the text names the file, the problem and the legal values."""
-
-
-def refuse(file: Path, problem: str) -> SourceError:
-    """Return an error whose message names the file and the problem."""
-    return SourceError(f'{file}: {problem}')
-
-
 class Spring(NamedTuple):
     """A spring along x = Σ share · q, a weighted sum of joint positions q.
 
@@ -384,19 +375,20 @@ def cut(
             is held fixed because of it.
 
     Raises:
-        SourceError: If a name is unknown or cannot be kept, or if no movable joint remains.
+        MusculoskeletalError: If a name is unknown or cannot be kept, or if no movable joint
+            remains.
     """
     model, links = source.model, source.links
     if base and base not in links:
-        raise SourceError(f'--base: unknown link {base!r}; links: {listed(links)}')
+        raise MusculoskeletalError(f'--base: unknown link {base!r}; links: {listed(links)}')
     if end and end not in {*links, *source.points}:
         legal = f'links: {listed(links)}; points: {listed([*source.points])}'
-        raise SourceError(f'--end: unknown link or point {end!r}; {legal}')
+        raise MusculoskeletalError(f'--end: unknown link or point {end!r}; {legal}')
     is_chosen, end = not end, source.point_link(end)
     root = source.place(base)[0] if base else 0
     inside = [i for i, above in enumerate(model.supports) if root in list(above)]
     if end and source.place(end)[0] not in inside:
-        raise SourceError(
+        raise MusculoskeletalError(
             f'--end {end!r} does not descend from --base {base!r}; choose another end or base'
         )
     source.links = [name for name in links if source.place(name)[0] in inside]
@@ -409,7 +401,8 @@ def cut(
     wanted = set(joints or free) - floating
     if missing := sorted(wanted - set(free)):
         kind = 'coupled' if missing[0] in couplings else 'unknown'
-        raise SourceError(f'--joints: {kind} joint {missing[0]!r}; joints: {", ".join(free)}')
+        problem = f'--joints: {kind} joint {missing[0]!r}'
+        raise MusculoskeletalError(f'{problem}; joints: {", ".join(free)}')
     if end:
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
         # Keep masters of coupled joints in the chain, because they move the chain as well.
@@ -431,7 +424,7 @@ def cut(
     for option, names in (('--muscles', muscles), ('--without', without)):
         if unknown := [name for name in names if name not in source.routes]:
             legal = ', '.join(source.routes)
-            raise SourceError(f'{option}: unknown muscle {unknown[0]!r}; muscles: {legal}')
+            raise MusculoskeletalError(f'{option}: unknown muscle {unknown[0]!r}; muscles: {legal}')
     for name, route in list(source.routes.items()):
         lost = [item.link for item in route if item.link not in source.links]
         if lost:
@@ -452,7 +445,7 @@ def cut(
     if not wanted:
         held = [note for note in source.notes if note.startswith('held fixed')]
         remedy = 'keep at least one by --joints, --base and --end'
-        raise SourceError('; '.join(['no movable joint remains', *held[:3], remedy]))
+        raise MusculoskeletalError('; '.join(['no movable joint remains', *held[:3], remedy]))
 
 
 def _floating_joints(source: Source) -> set[str]:

@@ -10,9 +10,8 @@ import numpy as np
 import yaml
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.figures import save_plot
-from musculoskeletal_ae.files import read_csv
+from musculoskeletal_ae.files import file_error, read_csv
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
@@ -49,7 +48,7 @@ def fit(args: Namespace) -> None:
     try:
         constants = fit_series_elastic(*table.T)
     except ValueError as error:
-        raise _refusal(args.table, str(error)) from error
+        raise file_error(args.table, str(error)) from error
     residual = 1e3 * (table[:, 2] - constants.elongation(table[:, 1], table[:, 0]))
     rms = math.sqrt(float(np.mean(residual**2)))
     fitted = {name: float(f'{values[0]:.6g}') for name, values in vars(constants).items()}
@@ -110,31 +109,27 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
 def read_table(file: Path) -> Array:
     """Read a table; return its rows (tension [N], absolute length [m], elongation [m]), (N, 3)."""
     rows = []
-    for number, line, cells in read_csv(file, COLUMNS, _refusal):
+    for number, line, cells in read_csv(file, COLUMNS):
         try:
             values = [float(cell) for cell in cells]
         except ValueError:
             values = []
         if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
-            raise _refusal(file, f'row {number}: expected 3 finite numbers, got {line[:80]!r}')
+            raise file_error(file, f'row {number}: expected 3 finite numbers, got {line[:80]!r}')
         if values[0] < 0.0:
-            raise _refusal(file, f'row {number}: expected tension >= 0 [N], got {line!r}')
+            raise file_error(file, f'row {number}: expected tension >= 0 [N], got {line!r}')
         if not 0.0 < values[1] <= LONGEST:
             legal = f'absolute_length > 0, at most {LONGEST:g} m'
             problem = f'row {number}: expected {legal}, got {line!r}'
-            raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
+            raise file_error(file, f'{problem}; divide lengths in mm by 1000')
         if values[2] < LEAST_ELONGATION:
             problem = f'row {number}: expected elongation >= 0 [m], got {line!r}'
-            raise _refusal(file, f'{problem}; state how much longer the muscle is than at 0 N')
+            raise file_error(file, f'{problem}; state how much longer the muscle is than at 0 N')
         if values[2] >= values[1]:
             problem = f'row {number}: expected elongation below absolute_length, got {line!r}'
-            raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
+            raise file_error(file, f'{problem}; divide lengths in mm by 1000')
         rows.append(values)
     return np.array(rows, dtype=float).reshape(-1, len(COLUMNS))
-
-
-def _refusal(file: Path, problem: str) -> RobotDescriptionError:
-    return RobotDescriptionError(f'{file}: {problem}')
 
 
 def plot(table: Array, constants: SeriesElastic, residual: Array) -> Any:

@@ -17,7 +17,7 @@ from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.importing.convert import import_robot, read_source
-from musculoskeletal_ae.importing.source import SourceError, compare, cut, urdf
+from musculoskeletal_ae.importing.source import compare, cut, urdf
 from musculoskeletal_ae.robot.description import TENSION_DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.import_robot import main
@@ -236,7 +236,7 @@ def test_what_is_included_must_be_a_regular_file(mjcf, tmp_path):
     mjcf.write_text(
         mjcf.read_text().replace('<worldbody>', '<include file="more.xml"/><worldbody>')
     )
-    with pytest.raises(SourceError, match=r"'more.xml' is not a regular file"):
+    with pytest.raises(MusculoskeletalError, match=r"'more.xml' is not a regular file"):
         import_robot(mjcf, tmp_path / 'out')
 
 
@@ -352,24 +352,28 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
         'dropped: SPHERICAL via point in the route of front, because no fixed point directly '
         'precedes it' in result.source.notes
     )
-    with pytest.raises(SourceError, match=r'no muscle remains; dropped: muscle still: .*joint$'):
+    with pytest.raises(
+        MusculoskeletalError, match=r'no muscle remains; dropped: muscle still: .*joint$'
+    ):
         import_robot(cardsflow, tmp_path / 'none', without=('front', 'back'))
     cardsflow.write_text('<cardsflow/>')
-    with pytest.raises(SourceError, match=r'has no muscle with a route$'):
+    with pytest.raises(MusculoskeletalError, match=r'has no muscle with a route$'):
         read_source(cardsflow)
 
 
 def test_a_model_without_routes_is_refused_with_the_dropped_muscles(tmp_path):
     text = re.sub('<spatial .*?</spatial>', '', bodies.MJCF, flags=re.DOTALL)
     file = put(tmp_path, 'own.xml', re.sub('<muscle [^>]*>', '', text))
-    with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: it is a fixed'):
+    with pytest.raises(
+        MusculoskeletalError, match=r'no muscle with a route; .*tendon none: it is a fixed'
+    ):
         read_source(file)
 
 
 def test_a_model_without_tendons_is_refused_because_it_has_none(tmp_path):
     file = put(tmp_path, 'none.xml', '<mujoco><worldbody><body><joint/><geom size=".1"/></body>'
                '</worldbody></mujoco>')  # fmt: skip
-    with pytest.raises(SourceError, match='it has no tendon'):
+    with pytest.raises(MusculoskeletalError, match='it has no tendon'):
         read_source(file)
 
 
@@ -452,7 +456,9 @@ def test_cardsflow_limits_beside_the_model_are_read(cardsflow, tmp_path):
 )
 def test_cardsflow_limits_that_are_none_are_refused(cardsflow, tmp_path, text):
     put(tmp_path, 'joint_limits.yaml', text)
-    with pytest.raises(SourceError, match=r'joint_limits\.yaml: .*expected a list of at least 2'):
+    with pytest.raises(
+        MusculoskeletalError, match=r'joint_limits\.yaml: .*expected a list of at least 2'
+    ):
         read_source(cardsflow)
 
 
@@ -488,7 +494,7 @@ def test_an_import_that_is_interrupted_leaves_nothing(mjcf, tmp_path, monkeypatc
 def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, expected):
     (tmp_path / 'model.urdf').unlink()
     put(tmp_path, 'model.sdf', bodies.SDF.replace(old, new, 1))
-    with pytest.raises(SourceError, match=re.escape(expected)):
+    with pytest.raises(MusculoskeletalError, match=re.escape(expected)):
         import_robot(cardsflow, tmp_path / 'out')
 
 
@@ -502,14 +508,16 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     assert robot.description.couplings['wrist'] == ('shoulder', (0.1, -0.5))
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
     put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
-    with pytest.raises(SourceError, match="a joint mimics 'moon', but there is no such joint"):
+    with pytest.raises(
+        MusculoskeletalError, match="a joint mimics 'moon', but there is no such joint"
+    ):
         read_source(file)
 
 
 def test_an_opensim_model_is_refused_with_the_way_to_convert_it(tmp_path):
     # Tags such as <A::B/> occur in files of OpenSim, although they are not valid XML.
     text = '<?xml version="1.0"?><OpenSimDocument Version="40000"><A::B/></OpenSimDocument>'
-    with pytest.raises(SourceError, match='convert this model to MJCF with MyoConverter'):
+    with pytest.raises(MusculoskeletalError, match='convert this model to MJCF with MyoConverter'):
         read_source(put(tmp_path, 'own.osim', text))
 
 
@@ -563,7 +571,7 @@ def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_pa
     ],
 )
 def test_a_wrong_option_names_what_is_legal(mjcf, options, expected):
-    with pytest.raises(SourceError, match=re.escape(expected)):
+    with pytest.raises(MusculoskeletalError, match=re.escape(expected)):
         cut(read_source(mjcf), **options)
 
 
