@@ -81,6 +81,8 @@ def measure(study: Study, seed: int) -> Measured:
     forces, delays = _collisions(loop, rng, study.number(COLLISIONS))
     soon = delays <= SOON + 1e-9
     loop.arm.reset()
+    # To the estimator of the other loop, the reset would be a jump of all lengths.
+    loop = ContactLoop(loop.arm, study.network(seed), settings, CONTACT_STREAM + seed)
     seconds = study.seconds(HEALTHY / len(study.seeds))
     contacts = _healthy(loop, seconds, study.seconds(WARM_UP))
     drift, moved = zip(*(_guide_by_hand(study, seed, rng) for _ in range(study.number(FLOATS))))
