@@ -124,7 +124,7 @@ class Learner:
             return
         # Without a usable saved network, repeat as many updates as the saved samples caused when
         # they were collected.
-        self.scheduler.restart(updates_to_repeat=len(self.samples))
+        self.scheduler.restart(updates=len(self.samples))
         if mae is not None:
             self.begin(mae)
 

@@ -78,32 +78,32 @@ class UpdateScheduler:
         self.last_update: Update | None = None
         self.statistics_hold = True
         self.least_samples = least_samples
-        self._has_news = True
+        self._due = 1  # number of updates to begin, even without further news
         self._began_at = -math.inf  # start of the last update [s]
         self._has_changed = False  # whether a muscle has changed since the start of the last update
-        self._updates_to_repeat = 0
 
-    def restart(self, updates_to_repeat: int = 0) -> None:
+    def restart(self, updates: int = 1) -> None:
         """Restart after the network has been replaced.
 
         Args:
-            updates_to_repeat: Number of updates that are run even without new samples.
+            updates: Number of updates that are run even without new samples; at least one is.
         """
-        self._updates_to_repeat, self.last_update = updates_to_repeat, None
+        self._due, self.last_update = max(1, updates), None
 
     def note_news(self) -> None:
         """Note that there are new data to learn from."""
-        self._has_news = True
+        self._due = max(1, self._due)
 
     def note_change(self) -> None:
         """Note that a muscle is relearned, which invalidates the detector's statistics."""
         self.statistics_hold = False
-        self._has_changed = self._has_news = True
+        self._has_changed = True
+        self.note_news()
 
     def is_due(self, now: float, sample_count: int) -> bool:
         """Return whether an update is due at `now` [s]."""
         is_recent = 0.0 <= now - self._began_at < LEAST_INTERVAL
-        return self._has_news and sample_count >= self.least_samples and not is_recent
+        return self._due > 0 and sample_count >= self.least_samples and not is_recent
 
     def begin(
         self,
@@ -114,7 +114,7 @@ class UpdateScheduler:
         steps: int,
     ) -> Job:
         """Begin an update of `steps` training steps at `now` [s]; return its job."""
-        self._has_news = self.updates + 1 < self._updates_to_repeat
+        self._due -= 1
         self._began_at, self._has_changed = now, False
         observed, statistics_hold = samples.observations(), self.statistics_hold
         return Job(observed, healthy.healthy(), statistics_hold, steps, isolated)
