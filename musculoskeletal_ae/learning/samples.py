@@ -120,10 +120,6 @@ class SampleStore:
         if len(self.stored) > self.capacity:
             del self.stored[self._dispensable()]
 
-    def all(self) -> list[Sample]:
-        """Return all samples, including the held ones."""
-        return [each.sample for each in (*self.stored, *self.held)]
-
     def forget(self, muscle: int, newest: int = 0) -> None:
         """Forget what all but the last `newest` samples say about a muscle."""
         for each in (*self.stored[: len(self.stored) - newest], *self.held):

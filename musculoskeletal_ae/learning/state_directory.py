@@ -17,7 +17,6 @@ import time
 from pathlib import Path
 from typing import TextIO
 
-from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.files import locked, read_bytes, write_whole
 from musculoskeletal_ae.learning import state_format
@@ -60,7 +59,7 @@ class StateStore:
         self._newest = self.directory / NEWEST
         self._previous = self.directory / PREVIOUS
         self._lock: TextIO | None = None
-        self._saved_samples: list[Sample] = []  # samples that are on disk
+        self._saved_count = 0  # number of accepted samples when the state was saved last
         self._problem = ''  # why the last save failed
         self._next_attempt = 0.0  # do not retry a failed save before this time [s]
         try:
@@ -120,7 +119,7 @@ class StateStore:
         if state is None:
             return None
         state_format.restore_samples(state, self._robot, samples)
-        self._saved_samples = samples.all()
+        self._saved_count = samples.accepted
         try:
             return state_format.restore_network(state, self._robot)
         except StateError as error:
@@ -185,8 +184,9 @@ class StateStore:
         """Return why the newest state is not on disk and how many samples are missing, or ''."""
         if not self._problem:
             return ''
-        on_disk = {id(sample) for sample in self._saved_samples}
-        count = sum(id(sample) not in on_disk for sample in samples.all())
+        count = samples.accepted - self._saved_count
+        if count < 0:  # the saved samples were replaced, after which they are numbered anew
+            count = samples.accepted
         return (
             f'samples and network cannot be saved ({self._problem}); samples not on disk yet: '
             f'{count}; free disk space or make {self.directory} writable, then saving succeeds'
@@ -233,7 +233,7 @@ class StateStore:
     def _save(self, samples: SampleStore, network: bytes | None) -> None:
         state = state_format.collect(self._robot, samples, network)
         write_whole(self._newest, state_format.to_bytes(state), self._previous)
-        self._saved_samples = samples.all()
+        self._saved_count = samples.accepted
 
     def _write_backup(self, state: SavedState) -> Path:
         backup = self._free_name()

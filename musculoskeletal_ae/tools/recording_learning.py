@@ -118,7 +118,7 @@ def train(args: Namespace) -> None:
     )
     if offsets := offset_text(robot, zero):
         print(f'estimated joint-sensor offsets: {offsets}')
-    learned = np.array([sample.theta for sample in learner.samples.all()])
+    learned = np.array([sample.theta for sample in learner.samples.samples])
     for source, earlier in zip(sources, before, strict=True):
         off = table_errors(learner.mae, source.table)
         change = f'{robot.units.error_text(earlier)} → {robot.units.error_text(off)}'
