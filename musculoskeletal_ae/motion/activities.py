@@ -108,5 +108,4 @@ def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
     tension = np.maximum(sample.motor_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
-    length = robot.actuation.unchanging_length(sample.length, sample.motor_tension)
-    return Command(LENGTH, length)
+    return Command(LENGTH, sample.length + msc_compensation(robot, tension))

@@ -54,7 +54,6 @@ class Actuation(ABC):
     """How the muscle modules of one arm turn commands into tensions, and what they measure.
 
     Attributes:
-        speed: Largest speed of each module [m/s], (M,); infinite if it is not known.
         follows_tensions: Whether the modules accept tension commands as well as length commands.
     """
 
@@ -62,10 +61,7 @@ class Actuation(ABC):
 
     def __init__(self, robot: Robot) -> None:
         """Describe the modules of `robot`, whose `tension.bias` must be 0 for isolated muscles."""
-        description = robot.description
-        self._robot, self._whole = robot, description.tension
-        self._stiffness, self._stated_release = description.stiffness, description.release
-        self.speed: Array = description.speed
+        self._robot = robot
 
     @property
     def _bias(self) -> Array:
@@ -80,7 +76,8 @@ class Actuation(ABC):
         It is 30 % of T_limit (DESIRED_SHARE), but at least T_bias. `check_robot` also prefers
         tensions near this share of T_limit.
         """
-        return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
+        whole = self._robot.description.tension
+        return np.maximum(whole.bias, DESIRED_SHARE * whole.limit)
 
     def known_tension(self, measured: Array) -> Array:
         """Return measured tensions [N], (..., M), or assumed tensions if none are measured."""
@@ -122,16 +119,6 @@ class Actuation(ABC):
         """
 
     @abstractmethod
-    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
-        """Return the length command [m], (M,), that produces wanted tensions in the same posture.
-
-        Args:
-            length: Present lengths [m], (M,).
-            tension: Present tensions [N], (M,).
-            wanted: The wanted tensions [N], (M,).
-        """
-
-    @abstractmethod
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
         """Return a command that moves the tensions towards the wanted tensions.
 
@@ -143,20 +130,6 @@ class Actuation(ABC):
         Returns:
             LENGTH and target lengths [m], or TENSION and target tensions [N], (M,).
         """
-
-    def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the length command that does not change lengths and tensions [m], (M,).
-
-        Position-controlled modules hold their lengths. Where the present tension is below T_bias, a
-        command under stiffness control demands T_bias.
-
-        Args:
-            length: Present lengths [m], (M,).
-            tension: Present tensions [N], (M,).
-        """
-        if not self.follows_tensions:
-            return length.copy()
-        return self.length_for(length, tension, np.maximum(tension, self._bias))
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:
         """Return the tension command that can replace a length command without a jump [N], (M,).
@@ -192,15 +165,14 @@ class Actuation(ABC):
         """
         if not self.follows_tensions:
             return np.zeros_like(speed)
-        tension: Array = self._stiffness * lag * speed
-        return tension
+        return self._robot.stiffness * lag * speed
 
     def fastest(self, rate_limit: float) -> Array:
         """Return the rate limit of each length command [m/s], (M,).
 
         This is `rate_limit` [m/s], or the speed of the module if it is lower.
         """
-        return np.minimum(rate_limit, self.speed)
+        return np.minimum(rate_limit, self._robot.description.speed)
 
     # -- limits ----------------------------------------------------------------------------------
 
@@ -264,8 +236,9 @@ class Actuation(ABC):
         By default it is the length that lowers the tension from T_limit to T_bias in the same
         posture.
         """
-        usual = self._robot.elongation(self._whole.limit) - self._robot.elongation(self._whole.bias)
-        stated = self._stated_release
+        robot, whole = self._robot, self._robot.description.tension
+        usual = robot.elongation(whole.limit) - robot.elongation(whole.bias)
+        stated = robot.description.release
         return np.where(np.isnan(stated), usual, stated)
 
     @abstractmethod
@@ -320,19 +293,12 @@ class StiffnessControl(Actuation):
             length: Measured lengths l [m], (M,).
             command: Target lengths l_target [m], (M,).
         """
-        demand: Array = self._bias + np.maximum(0.0, self._stiffness * (length - command))
+        demand: Array = self._bias + np.maximum(0.0, self._robot.stiffness * (length - command))
         return demand
 
     def tension_per_length(self, tension: Array) -> Array:  # noqa: ARG002
         """Return the control stiffness K_stiff of each module [N/m], (M,), at any tension."""
-        return self._stiffness
-
-    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:  # noqa: ARG002
-        """Return the length command that demands the wanted tensions at `length` [m], (M,).
-
-        Each command is shorter than the length by (wanted tension − T_bias) / control stiffness.
-        """
-        return length - (wanted - self._bias) / self._stiffness
+        return self._robot.stiffness
 
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:  # noqa: ARG002
         """Return a tension command of `wanted` [N], (M,), because these modules follow tensions."""
@@ -344,7 +310,7 @@ class StiffnessControl(Actuation):
 
     def largest_depth(self, limit: Array) -> Array:
         """Return the largest `depth` [m] for any T and dT/dt, (M,)."""
-        depth: Array = (limit - self._bias) / self._stiffness
+        depth: Array = (limit - self._bias) / self._robot.stiffness
         return depth
 
     def released(
@@ -367,8 +333,8 @@ class StiffnessControl(Actuation):
 
         The demanded tension follows from the measured length and the length command, both [m].
         """
-        measured = tension - self._whole.bias[muscle]
-        return float(max(measured, self._stiffness[muscle] * (length - command)))
+        measured = tension - self._robot.description.tension.bias[muscle]
+        return float(max(measured, self._robot.stiffness[muscle] * (length - command)))
 
 
 class PositionControl(Actuation):
@@ -386,20 +352,16 @@ class PositionControl(Actuation):
         stiffness: Array = 1.0 / self._robot.series_elastic.compliance(at_zero, tension)
         return stiffness
 
-    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
-        """Return the length command [m], (M,), that produces wanted tensions in the same posture.
-
-        The command differs from the present length by the change of the elongation of series
-        elastic element and tendon.
-        """
-        elongation = self._robot.elongation
-        return length + elongation(tension) - elongation(wanted)
-
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
-        """Return a length command [m], (M,), that corrects half of the error of each tension."""
+        """Return a length command [m], (M,), that corrects half of the error of each tension.
+
+        In the same posture, the length changes by as much as the elongation of series elastic
+        element and tendon.
+        """
         measured = np.maximum(tension, 0.0)
         goal = measured + ADMITTANCE * (wanted - measured)
-        return LENGTH, self.length_for(length, measured, goal)
+        elongation = self._robot.elongation
+        return LENGTH, length + elongation(measured) - elongation(goal)
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
         """Return by how much a command may be shorter than the measured length [m], (M,).
@@ -430,7 +392,7 @@ class PositionControl(Actuation):
         keeps its command `last`. Where no tension is measured, or it is out of date, the result is
         `start` plus `release`.
         """
-        robot, bias = self._robot, self._whole.bias
+        robot, bias = self._robot, self._robot.description.tension.bias
         end = start + self.release
         if is_fresh and self._robot.tension_source.is_known:
             excess = robot.elongation(tension) - robot.elongation(bias)
@@ -443,7 +405,7 @@ class PositionControl(Actuation):
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:  # noqa: ARG002
         """Return by how much the measured tension of the muscle exceeds T_bias [N]."""
-        return float(tension - self._whole.bias[muscle])
+        return float(tension - self._robot.description.tension.bias[muscle])
 
 
 ACTUATIONS: dict[str, type[Actuation]] = {STIFFNESS: StiffnessControl, POSITION: PositionControl}

@@ -50,8 +50,6 @@ class Robot:
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)
         self.stiffness = description.stiffness
         self.tension_source = description.tension_source
-        #: how the modules turn commands into tensions, and what they measure
-        self.actuation: Actuation = ACTUATIONS[description.actuation](self)
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
@@ -66,6 +64,11 @@ class Robot:
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
         #: units of the joints in files, messages and texts
         self.units = self.kinematics.units
+
+    @property
+    def actuation(self) -> Actuation:
+        """How the modules turn commands into tensions, and what they measure."""
+        return ACTUATIONS[self.description.actuation](self)
 
     @classmethod
     def load(cls, robot: str | Path) -> Robot:
@@ -139,7 +142,6 @@ class Robot:
         reduced.isolated = tuple(sorted(muscles))
         used = reduced.used = ~np.isin(np.arange(self.muscle_count), reduced.isolated)
         reduced.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
-        reduced.actuation = type(self.actuation)(reduced)
         return reduced
 
     def with_routes(self, routes: Iterable[Route]) -> Robot:
@@ -148,7 +150,6 @@ class Robot:
         changed.description = replace(self.description, routes=tuple(routes))
         changed.routes = Routes(self.kinematics, changed.description.routes)
         changed.groups = groups(changed.routes.crossed)
-        changed.actuation = type(self.actuation)(changed)
         return changed
 
     def with_moved_points(self, shifts: Iterable[Array]) -> Robot:

@@ -420,7 +420,7 @@ class QuasiStatics:
             (robot.stiffness, (most - bias) / robot.stiffness, 0.0 * most),
             (np.full_like(most, RIGID), farthest, farthest),
         )
-        kept, speed = robot.actuation.kept_tension, robot.actuation.speed
+        kept, speed = robot.actuation.kept_tension, robot.description.speed
         muscles = stiffness, kept, most, span, loose, friction, speed
         units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
         joints = robot.lower, robot.upper, self._viscosity

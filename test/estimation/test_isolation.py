@@ -15,6 +15,7 @@ from musculoskeletal_ae.estimation.suspect_verification import (
     Verification,
 )
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.remedy_steps import REPAIR
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
@@ -84,7 +85,7 @@ class Loop:
     def __init__(self, robot, mae, healthy):
         self.core, self.now = Estimator(robot), 100.0
         # The healthy modules follow this command.
-        self.command = robot.actuation.unchanging_length(healthy.length, healthy.tension)
+        self.command = healthy.length + msc_compensation(robot, healthy.tension)
         self.core.use(mae)
         self.core.suspects.isolates = True
         self.rng, self.length = np.random.default_rng(0), healthy.length

@@ -31,19 +31,19 @@ class GeometricBody:
 def test_modules_follow_stiffness_control_unless_the_file_says_positions(tmp_path):
     usual = Robot.load(write_robot(tmp_path / 'a'))
     assert usual.actuation.follows_tensions
-    assert (usual.stiffness == 1e4).all() and np.isinf(usual.actuation.speed).all()
+    assert (usual.stiffness == 1e4).all() and np.isinf(usual.description.speed).all()
     robot = Robot.load(write_robot(tmp_path / 'b', actuation='position', speed=0.2, release=0.02))
     assert not robot.actuation.follows_tensions
-    assert (robot.actuation.speed == 0.2).all() and (robot.actuation.release == 0.02).all()
+    assert (robot.description.speed == 0.2).all() and (robot.actuation.release == 0.02).all()
     plain = Robot.load(write_robot(tmp_path / 'c', actuation='position'))
-    assert (plain.actuation.speed == SPEED_DEFAULT).all()
+    assert (plain.description.speed == SPEED_DEFAULT).all()
     paid_out = plain.elongation(plain.tension.limit) - plain.elongation(plain.tension.bias)
     np.testing.assert_allclose(plain.actuation.release, paid_out)
     document = read_muscles(tmp_path / 'b')
     document['muscles'][1] |= {'speed': 0.05, 'release': 0.01}
-    actuation = Robot.load(write_muscles(tmp_path / 'b', document)).actuation
-    assert actuation.speed[1] == 0.05 and actuation.release[1] == 0.01
-    assert actuation.speed[0] == 0.2
+    robot = Robot.load(write_muscles(tmp_path / 'b', document))
+    assert robot.description.speed[1] == 0.05 and robot.actuation.release[1] == 0.01
+    assert robot.description.speed[0] == 0.2
 
 
 @pytest.mark.parametrize(

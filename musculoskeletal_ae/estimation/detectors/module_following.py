@@ -102,7 +102,7 @@ class ModuleFollowing(Detector):
         self._length = length
         correcting = np.maximum(np.sign(self._difference) * self._speed, 0.0)
         growth = self._growth(observation, np.abs(self._difference), correcting)
-        is_full = correcting > FULL_SPEED * self._robot.actuation.speed
+        is_full = correcting > FULL_SPEED * self._robot.description.speed
         growth = np.where(is_full | ~observation.sample.usable, -1.0, np.clip(growth, -1.0, 1.0))
         self._evidence = np.maximum(self._evidence + growth * dt, 0.0)
         if self._evidence.max() < FAULTY:
