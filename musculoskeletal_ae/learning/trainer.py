@@ -82,15 +82,12 @@ class Trainer:
 # -- separate training process --------------------------------------------------------------------
 
 NICENESS = 5  # run the training process with a niceness higher than the node's by this
-FIRST_PAUSE = 1.0  # wait this long before restarting a lost training process [s]; doubles each time
-LONGEST_PAUSE = 60.0  # wait at most this long before restarting a lost training process [s]
-#: restart a training process, as hung, if its first answer takes longer than this [s], plus
-#: PATIENCE_PER_STEP for each training step; imports take minutes on a slow disk
-PATIENCE_AT_FIRST = 300.0
-#: restart a training process if a later answer takes longer than this [s], plus PATIENCE_PER_STEP
-#: for each training step
-PATIENCE = 60.0
-PATIENCE_PER_STEP = 0.1  # wait this much longer for each training step of the job [s]
+#: Wait this long before restarting a lost training process [s]. A process that dies in each start,
+#: for example because memory is short, then takes little time from the other nodes.
+PAUSE = 5.0
+#: restart a training process, as hung, if an answer takes longer than this [s]; imports take
+#: minutes on a slow disk
+PATIENCE = 300.0
 LONGEST_ENDING = 2.0  # wait at most this long for a killed training process to end [s]
 
 
@@ -108,8 +105,8 @@ class TrainerProcess(Trainer):
         self._mae: Mae | None = None
         self._job: Job | None = None
         self._process: SpawnProcess | None = None
-        self._pause = FIRST_PAUSE
-        self._restart_at = self._deadline = math.inf
+        #: without a process, start one at this time; with a job, expect its answer until then [s]
+        self._due = math.inf
 
     def begin(self, mae: Mae) -> None:
         """Begin with a network in a new process, which replaces the present one."""
@@ -119,7 +116,6 @@ class TrainerProcess(Trainer):
 
     def _start(self) -> None:
         assert self._mae is not None
-        self._patience = PATIENCE_AT_FIRST
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Update | str] = queue.SimpleQueue()
         context = multiprocessing.get_context('spawn')
@@ -132,7 +128,7 @@ class TrainerProcess(Trainer):
         except OSError as error:
             self._schedule_restart(f'cannot be started ({error})')
             return
-        self._process, self._restart_at = process, math.inf
+        self._process, self._due = process, math.inf
         talk = ours, process, self._mae, self.robot, self._jobs, self._answers
         self._thread = threading.Thread(target=_talk, args=talk, daemon=True)
         self._thread.start()
@@ -151,36 +147,35 @@ class TrainerProcess(Trainer):
 
     def submit(self, job: Job) -> None:
         """Submit a job to the training process; `poll` returns its update later."""
-        self._job = job
-        self._deadline = time.monotonic() + self._patience + PATIENCE_PER_STEP * job.steps
+        self._job, self._due = job, time.monotonic() + PATIENCE
         self._jobs.put(job)
 
     def poll(self) -> Update | None:
         """Return the update if it has arrived, else None; restart a lost process after a pause."""
         now = time.monotonic()
-        if now >= self._restart_at:
-            self._start()
-        if self._process is None or self._job is None:
+        if self._process is None:
+            if now >= self._due:
+                self._start()
+            return None
+        if self._job is None:
             return None
         try:
             answer = self._answers.get_nowait()
         except queue.Empty:
-            if now > self._deadline:
+            if now > self._due:
                 self._schedule_restart('did not answer in time')
             return None
         if isinstance(answer, str):
             self._schedule_restart(f'died ({answer})')
             return None
-        self.trouble, self._pause, self._patience = '', FIRST_PAUSE, PATIENCE
-        self._mae, self._job = answer.mae, None
+        self.trouble, self._mae, self._job = '', answer.mae, None
         return answer
 
     def _schedule_restart(self, problem: str) -> None:
         self._end()
         self.restarts += 1
         self.trouble = f'the training process {problem}; restarting it'
-        self._restart_at = time.monotonic() + self._pause
-        self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
+        self._due = time.monotonic() + PAUSE
 
     def _end(self) -> None:
         # The process may be killed at once, because this object can repeat the job and keeps the
@@ -200,7 +195,7 @@ class TrainerProcess(Trainer):
     def close(self) -> None:
         """End the process and discard the job."""
         self._end()
-        self._job, self._restart_at = None, math.inf
+        self._job, self._due = None, math.inf
 
 
 def _talk(

@@ -19,7 +19,7 @@ PATIENCE = 300.0  # longest wait for an update [s]; a busy machine needs minutes
 
 @pytest.fixture
 def process(arm26, monkeypatch):
-    monkeypatch.setattr(trainers, 'FIRST_PAUSE', 0.0)
+    monkeypatch.setattr(trainers, 'PAUSE', 0.0)
     process = TrainerProcess(arm26, 'default')
     yield process
     process.close()
@@ -77,7 +77,6 @@ def test_a_training_process_that_cannot_start_dies_or_hangs_is_replaced_and_its_
     os.kill(first, signal.SIGSTOP)
     with monkeypatch.context() as patch:
         patch.setattr(trainers, 'PATIENCE', 0.3)
-        process._patience = 0.3
         # The job is larger than the buffer of a pipe, so sending it to a suspended process blocks.
         process.submit(job(stage.store(4), stage.messages(20_000), steps=1))
         assert answer(process) is None
