@@ -24,6 +24,7 @@ from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
+from robots import with_modules
 
 from bench.learned_arm import add_initial, initial_network
 from musculoskeletal_ae.emulator.modules import Arm
@@ -37,7 +38,6 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 #: explore and learn for EXPLORED, and then measure in a held-out motion of HELD_OUT [s]

@@ -2,16 +2,26 @@
 """Robot directories for tests: an arm with other names, sizes and order than the shipped ones."""
 
 import copy
+import math
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from musculoskeletal_ae.robot.description import (
+    SPEED_DEFAULT,
+    STIFFNESS_DEFAULT,
+    RobotDescription,
+)
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.motors import FILE
+from musculoskeletal_ae.robot.muscle_file import POSITION
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension_source import CURRENT, TensionSource
 
 # The chain is listed from the hand to the base, and contains a fixed joint and a rotated frame.
 # Tests therefore cannot pass only because elements are in order or rotations are identities.
@@ -90,6 +100,26 @@ MUSCLES: dict[str, Route] = {
         ('lower', (-0.036, -0.01, 0.005)),
     ],
 }
+
+
+def with_modules(
+    description: RobotDescription, actuation: str, tension_source: str = 'sensor'
+) -> RobotDescription:
+    """Return the description with another kind of muscle modules and their default values.
+
+    `actuation` and `tension_source` have the values that they may have in muscles.yaml. A motor
+    current becomes a tension at 60 N/A: 0.03 N·m/A, a gear of 20, and a spool of 10 mm.
+    """
+    follows_position, ones = actuation == POSITION, np.ones(len(description.muscles))
+    scale = 60.0 * ones if tension_source == CURRENT else None
+    return replace(
+        description,
+        actuation=actuation,
+        tension_source=TensionSource(tension_source, scale),
+        stiffness=ones * (math.inf if follows_position else STIFFNESS_DEFAULT),
+        speed=ones * (SPEED_DEFAULT if follows_position else math.inf),
+        release=np.full_like(ones, math.nan),
+    )
 
 
 def write_robot(

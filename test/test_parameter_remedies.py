@@ -6,7 +6,7 @@ from argparse import ArgumentTypeError
 
 import pytest
 from remedies import check_remedy, members
-from robots import write_robot
+from robots import with_modules, write_robot
 
 from musculoskeletal_ae import options
 from musculoskeletal_ae.control.settings import METHODS, Settings
@@ -17,7 +17,6 @@ from musculoskeletal_ae.mae.training import train_on
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS, check_names
 from musculoskeletal_ae.presets.registry import preset_named
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.experiment import _names as experiment_names
 

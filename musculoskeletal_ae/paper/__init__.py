@@ -8,7 +8,7 @@ IEEE Robotics and Automation Letters, 2020. Section and equation numbers are the
     §III-A          network.py            layers, units, masks
     §III-B  (2, 3)  initial_training.py   random states of the geometric model, L_initial, Adam
     §III-C          online_learning.py    the batches, and when the network is updated
-    §III-D  (4)     state_estimation.py   the estimate, and the anomaly detector that uses A
+    §III-D  (4)     state_estimation.py   the anomaly detector that uses A
     §III-E  (5–8)   control.py            muscle stiffness control; geometric, first, second
     §III-E  (9–12)  control.py            the proposed control
     §III-E  (10,11) latent_descent.py     the descent in the latent space

@@ -4,9 +4,10 @@
     (θ_est, T_est, l_est) = f_decode(f_encode,2(T, l))
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                                                          (4)
 
-Both presets share the estimate (`estimation/estimate.py`). The paper leaves three
-things open, which we chose: the anomaly score A is in scaled units, its threshold comes from the
-checkpoint, and a muscle is reported when A exceeds the threshold in five consecutive messages.
+Both presets share the estimate (`mae/mae.py`, `Mae.estimate`). This file has the detector of the
+paper. The paper leaves three things open, which we chose: the anomaly score A is in scaled units,
+its threshold comes from the checkpoint, and a muscle is reported when A exceeds the threshold in
+five consecutive messages.
 """
 
 import math
@@ -14,15 +15,8 @@ import math
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
 from musculoskeletal_ae.estimation.finding import Observation
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import NORM
-from musculoskeletal_ae.mae.units import Mask, State
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
-
-
-def estimate(mae: Mae, tension: Array, length: Array) -> State:
-    """Return (θ_est, T_est, l_est) from T [N] and l [m], (..., M)."""
-    return mae.decode(mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
 
 
 class AnomalyNorm(ResidualDistance):

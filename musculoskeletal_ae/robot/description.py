@@ -9,7 +9,7 @@ it again.
 import math
 import re
 from collections.abc import Callable, Container, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,8 +56,6 @@ LEAST_EIGENVALUE = -1e-9
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}
 STIFFNESS_DEFAULT = 10000.0  # K_stiff of a muscle whose entry states none [N/m]
 SPEED_DEFAULT = 0.1  # assume this speed of a position-controlled module that states none [m/s]
-#: scale of a motor current in `with_modules` [N per A]: 0.03 N·m/A, gear of 20, spool of 10 mm
-NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (
     'the tension is unknown, so these are not available: contact estimation, tension control, the '
     'torque balance, the tension limit, the heat limit, and the detection of slack and ruptured '
@@ -591,22 +589,3 @@ def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
         str(link.name): sum(model.names[i] in names for i in model.supports[link.parentJoint])
         for link in body_frames(model)
     }
-
-
-def with_modules(
-    description: RobotDescription, actuation: str, tension_source: str = 'sensor'
-) -> RobotDescription:
-    """Return the description with another kind of muscle modules and their default values.
-
-    `actuation` and `tension_source` have the values that they may have in muscles.yaml.
-    """
-    follows_position, ones = actuation == POSITION, np.ones(len(description.muscles))
-    scale = ones * NEWTON_PER_AMPERE if tension_source == CURRENT else None
-    return replace(
-        description,
-        actuation=actuation,
-        tension_source=TensionSource(tension_source, scale),
-        stiffness=ones * (math.inf if follows_position else STIFFNESS_DEFAULT),
-        speed=ones * (SPEED_DEFAULT if follows_position else math.inf),
-        release=np.full_like(ones, math.nan),
-    )

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from robots import with_modules
 
 from bags import bag_samples as samples
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
@@ -12,7 +13,6 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 

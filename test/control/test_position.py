@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from readings import reading
+from robots import with_modules
 
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
@@ -23,7 +24,7 @@ from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.motion.tension_plan import plan_at_rest
-from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules
+from musculoskeletal_ae.robot.description import SPEED_DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import slid
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream

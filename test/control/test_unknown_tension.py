@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from exact_mae import ExactMae
 from readings import reading
-from robots import write_robot
+from robots import with_modules, write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
@@ -19,7 +19,6 @@ from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.learning.collector import NONE
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.motion.activities import LENGTH
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError

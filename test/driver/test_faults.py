@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from readings import reading
+from robots import with_modules
 
 from driver.scripted import Driver, RecordedArm, array, joint_state, muscle_rows, record
 from musculoskeletal_ae.awake_clock import AwakeClock
@@ -25,7 +26,7 @@ from musculoskeletal_ae.driver.stiffness_motion_test import Winding
 from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import message_reading
-from musculoskeletal_ae.robot.description import TensionRange, with_modules
+from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic

@@ -5,12 +5,12 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from robots import with_modules
 
 from driver.scripted import Driver, array, joint_state, muscle_rows
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion_test import ABOVE_BIAS
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM26 = Robot.load('arm26')

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from robots import copy_robot, read_muscles, write_muscles
+from robots import copy_robot, read_muscles, with_modules, write_muscles
 
 from driver.scripted import Driver, array, joint_state, muscle_rows
 from driver.test_faults import (
@@ -48,7 +48,7 @@ from musculoskeletal_ae.driver.position_motion_test import Positioning
 from musculoskeletal_ae.driver.stiffness_motion_test import Winding
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import TensionRange, with_modules
+from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface

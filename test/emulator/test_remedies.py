@@ -6,14 +6,13 @@ import re
 import bodies
 import pytest
 from remedies import check_remedy, listed, members
-from robots import read_muscles, write_muscles, write_robot
+from robots import read_muscles, with_modules, write_muscles, write_robot
 
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import read_sensors
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.convert import import_robot
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exact_mae import rest_readings
+from robots import with_modules
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.module_following import FAULTY, PositionFollowing
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
 from musculoskeletal_ae.estimation.suspect_verification import Outcome, Verification
 from musculoskeletal_ae.experiments.detection import observe
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 DT, THETA, MUSCLE = 0.01, np.array([0.2, -0.9]), 2

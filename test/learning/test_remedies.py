@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 from remedies import check_remedy, members
+from robots import with_modules
 
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning import state_directory as states
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.state_directory import NETWORK, StateStore
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 from .test_learner import IdleTrainer

@@ -2,6 +2,7 @@
 """Learning from lengths and joint angles only: unknown tensions give no torque balance."""
 
 import numpy as np
+from robots import with_modules
 
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
@@ -9,7 +10,6 @@ from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.synthetic import synthetic_samples
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.mae.units import scale_vector
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot(

@@ -7,7 +7,7 @@ import bodies
 import numpy as np
 import pytest
 from exact_mae import ExactMae
-from robots import read_muscles, write_muscles, write_robot
+from robots import read_muscles, with_modules, write_muscles, write_robot
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.fit import fit_body
@@ -32,7 +32,6 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.methods import StiffnessModel
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension

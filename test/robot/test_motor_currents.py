@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from exact_mae import ExactMae
 from readings import reading
-from robots import read_muscles, write_muscles, write_robot
+from robots import read_muscles, with_modules, write_muscles, write_robot
 
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings
@@ -15,7 +15,6 @@ from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.experiments.recording import ClosedLoop
-from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.muscle_states import read_muscle_states
