@@ -7,7 +7,6 @@ unpickling can run arbitrary code.
 """
 
 import json
-import math
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,10 +48,6 @@ SMALLEST_EIGENVALUE = 1e-12
 #: reject a stiffness matrix of the springs with an eigenvalue below this multiple of the largest
 #: one; rounding can make eigenvalues slightly negative, springs cannot
 SMALLEST_SPRING_EIGENVALUE = -1e-6
-#: Reject a network if its postures of a prismatic joint span less than this share of the joint's
-#: range. Early networks, which took the positions of such joints in m, have a 17 times smaller
-#: span. A network whose inputs are not standardised passes, because its span is unknown.
-LEAST_SPAN = 0.25
 #: reject a network whose estimate at the middle of all joint ranges exceeds these absolute values:
 #: θ [rad], T [N], l [m] and muscle Jacobian G [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
@@ -433,15 +428,6 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
         raise CheckpointError(
             'learned with motor currents (tension_source: current); '
             f'this robot has tension_source: {robot.tension_source.kind}'
-        )
-    _, spread = mae.usual_posture
-    narrow = math.sqrt(12.0) * spread < LEAST_SPAN * (robot.upper - robot.lower)
-    is_standardised = bool((mae.std != 1.0).any())
-    if is_standardised and (narrow & robot.units.slides).any():
-        names = ', '.join(np.array(robot.joints)[narrow & robot.units.slides])
-        raise CheckpointError(
-            f'its postures of {names} span less than {LEAST_SPAN:.0%} of the joint range, as in '
-            'networks of an early version, which took the positions of prismatic joints in m'
         )
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)
