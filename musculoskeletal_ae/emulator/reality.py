@@ -30,8 +30,8 @@ def make_arm(
             that the learner can fit; 'foreign' has mechanics that the learner does not model.
             Any other value is the path of the `model.xml` that `import_robot` wrote beside the
             robot.
-        friction: False removes the friction of tendons and joints. It has no effect on an
-            individual of an MJCF file (`deviates`).
+        friction: False removes the friction of tendons and joints. It has no effect on the body of
+            an MJCF file.
         deviates: Whether the body of a file is an individual that differs from the file
             (`emulator/foreign/deviation.py`). By default it equals the file.
 

@@ -274,10 +274,8 @@ class ForeignArm(Arm):
         Args:
             robot: The robot to emulate.
             seed: Selects the individual.
-            effects: Sizes of the effects; by default the calibrated ones. They apply to a body that
-                is built from the robot directory. An arm that equals `file` uses only
-                `joint_friction`: the value 0 removes all friction that the file defines. An arm
-                that deviates from `file` ignores `effects`.
+            effects: Sizes of the effects of a body that is built from the robot directory; by
+                default the calibrated ones. A body of `file` ignores them.
             file: The `model.xml` that `import_robot` wrote beside the robot, instead of a body that
                 is built from the robot directory.
             deviates: Whether the arm is an individual that differs from `file`
@@ -286,9 +284,9 @@ class ForeignArm(Arm):
         Raises:
             MusculoskeletalError: If the robot or the file cannot be built.
         """
-        self.effects = (effects or Effects()) if file is None else NONE
-        if file is not None and deviates:
-            self.effects = deviation.effects(robot)
+        self.effects = effects or Effects()
+        if file is not None:
+            self.effects = deviation.effects(robot) if deviates else NONE
         draw = self._draw = Draw(seed, self.effects)
         try:
             if file is None:
@@ -308,8 +306,6 @@ class ForeignArm(Arm):
         self._upright_gravity = model.opt.gravity.copy()
         if file is None or deviates:
             self._set_joint_friction()
-        elif effects is not None and effects.joint_friction == 0.0:
-            model.dof_frictionloss[:] = model.tendon_frictionloss[:] = 0.0
         self._angles, self._rates = data.qpos, data.qvel
         self._order = np.array([model.joint(name).id for name in robot.joints])
         self._hand = model.body(HAND).id
