@@ -8,7 +8,6 @@ beside `paper.md`). `experiment paper --page doc/results/paper.md` copies its ow
 to that folder first. The text is in paper.md.jinja, and the rows of the tables are in paper.yaml.
 """
 
-import shutil
 import sys
 from collections.abc import Mapping
 from io import BytesIO
@@ -23,6 +22,7 @@ from musculoskeletal_ae.experiments.results import (
     NOTHING,
     ResultRow,
     Results,
+    copy_results,
     flat,
     individuals,
     read,
@@ -64,12 +64,7 @@ def update_page(page: Path, measured: Path | None = None) -> list[Path]:
     """
     folder, files = page.with_suffix(''), list[Path]()
     if measured is not None:
-        for name in PAPER:
-            result = measured / name / 'result.json'
-            if result.is_file():
-                files.append(folder / name / 'result.json')
-                files[-1].parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(result, files[-1])
+        files += copy_results(measured, page, PAPER)
         for picture, (name, plot) in PICTURES.items():
             drawn = measured / name / f'{plot}.png'
             if drawn.is_file():

@@ -3,15 +3,16 @@
 
     python -m musculoskeletal_ae.experiments.results doc/results.md
 
-This command rewrites the table of the page from the result.json files in doc/results. `experiment …
---readme doc/results.md` copies its own result.json files to doc/results first.
+This command rewrites the table of the page from the result.json files in the folder beside the page
+(`results/` beside `results.md`). `experiment … --readme doc/results.md` copies its own result.json
+files to that folder first.
 """
 
 import base64
 import json
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +40,6 @@ MOTIONS = ('approaches', 'missed', 'stuck')
 TOTALS = (*ALARMS, *ISOLATIONS, *MOTIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
 #: lines of a page between which the results table is written
 BEGIN, END = '<!-- results -->', '<!-- /results -->'
-KEPT = Path('doc/results')
 #: name of the template of report.html, a file in the folder of this module
 TEMPLATE = 'report.html.jinja'
 NOTHING = '–'
@@ -274,24 +274,42 @@ def failures(results: Results) -> list[str]:
     ]
 
 
+def copy_results(measured: Path, page: Path, names: Iterable[str]) -> list[Path]:
+    """Copy result.json files of an output folder to the folder of a page; return the copies.
+
+    Args:
+        measured: Output folder of `experiment`.
+        page: File of the page; its results are in the folder of the same name beside it.
+        names: Names of the experiments; those without a result are left out.
+    """
+    kept, files = page.with_suffix(''), list[Path]()
+    if measured.resolve() == kept.resolve():
+        return files
+    for name in names:
+        result = measured / name / 'result.json'
+        if result.is_file():
+            files.append(kept / name / 'result.json')
+            files[-1].parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(result, files[-1])
+    return files
+
+
 def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
     """Update the results table of a page; return the written files.
 
-    The numbers come from the folder of results beside the page. If `measured` is a folder, its
-    result.json files are first copied there.
+    Args:
+        readme: File of the page; its results are in the folder of the same name beside it.
+        measured: Output folder of `experiment`, from which results are first copied, or None if
+            they are already there.
 
     Raises:
         OSError: If the page cannot be read or written.
         MusculoskeletalError: If the page lacks the marker before or after the table.
     """
     (head, rest), files = text_around_table(readme), list[Path]()
-    kept = readme.parent / (KEPT.name if readme.parent.resolve().name == 'doc' else KEPT)
-    if measured is not None and measured.resolve() != kept.resolve():
-        for name in read(measured):
-            files.append(kept / name / 'result.json')
-            files[-1].parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(measured / name / 'result.json', files[-1])
-    table_text = readme_table(read(kept))
+    if measured is not None:
+        files += copy_results(measured, readme, read(measured))
+    table_text = readme_table(read(readme.with_suffix('')))
     readme.write_text(f'{head}{BEGIN}{table_text}{END}{rest}', encoding='utf-8')
     return [*files, readme]
 

@@ -41,7 +41,10 @@ def main(argv: list[str] | None = None) -> int:
         'all workers must share the folder'
     )
     parser.add_argument('--keep', type=Path, metavar='DIR', help=text)
-    text = 'also write the results table between the markers of this page'
+    text = (
+        'also write the results table between the markers of this page, and copy the results to '
+        'the folder of its name'
+    )
     parser.add_argument('--readme', type=Path, metavar='FILE', help=text)
     text = "also write the page FILE.md that shows the paper's results beside ours, with pictures"
     parser.add_argument('--page', type=Path, metavar='FILE.md', help=text)

@@ -19,7 +19,6 @@ from musculoskeletal_ae.experiments import (
     runner,
 )
 from musculoskeletal_ae.experiments.results import (
-    KEPT,
     combine,
     read,
     readme_table,
@@ -89,7 +88,7 @@ def test_both_kinds_of_bars_show_the_mean_of_the_individuals_that_have_a_value()
 @pytest.fixture
 def kept(tmp_path):
     """Return the folder of a copy of the committed results."""
-    return shutil.copytree(Path(__file__).parents[2] / KEPT, tmp_path / 'results')
+    return shutil.copytree(Path(__file__).parents[2] / 'doc' / 'results', tmp_path / 'results')
 
 
 def changed(kept, name, **numbers):

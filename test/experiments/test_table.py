@@ -10,7 +10,6 @@ from musculoskeletal_ae.experiments import PAPER, paper_page
 from musculoskeletal_ae.experiments.results import (
     BEGIN,
     END,
-    KEPT,
     read,
     readme_table,
     update_readme,
@@ -20,7 +19,9 @@ from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
 REPOSITORY = Path(__file__).parents[2]
-PAGE = REPOSITORY / 'doc' / 'results' / 'paper.md'
+RESULTS = REPOSITORY / 'doc' / 'results.md'
+KEPT = RESULTS.with_suffix('')
+PAGE = KEPT / 'paper.md'
 ROWS = [(name, row) for name, rows in TABLE.items() for row in rows]
 
 
@@ -30,14 +31,14 @@ def rows(key):
 
 
 def test_the_page_shows_the_committed_results():
-    text = (REPOSITORY / 'doc' / 'results.md').read_text(encoding='utf-8')
+    text = RESULTS.read_text(encoding='utf-8')
     between = text.split(BEGIN)[1].split(END)[0]
     remedy = 'run: python -m musculoskeletal_ae.experiments.results doc/results.md'
-    assert between == readme_table(read(REPOSITORY / KEPT)), remedy
+    assert between == readme_table(read(KEPT)), remedy
 
 
 def test_committed_results_are_of_full_runs_of_every_experiment():
-    results, of_page = read(REPOSITORY / KEPT), read(PAGE.with_suffix(''))
+    results, of_page = read(KEPT), read(PAGE.with_suffix(''))
     assert set(results) | set(of_page) == set(EXPERIMENTS)
     assert set(of_page) <= set(PAPER)
     for name, result in [*results.items(), *of_page.items()]:
@@ -69,7 +70,7 @@ def test_a_page_without_results_is_refused(tmp_path):
 
 @pytest.mark.parametrize(('name', 'row'), ROWS, ids=[row.quantity for _, row in ROWS])
 def test_every_row_is_filled_from_the_committed_results(name, row):
-    result = read(REPOSITORY / KEPT)[name]
+    result = read(KEPT)[name]
     for key in filter(None, (row.paper.format(preset=PAPER_PRESET), row.default, row.bound)):
         assert row.number(result, key) is not None, key
 
@@ -81,10 +82,10 @@ def test_a_row_of_the_worst_individual_shows_the_largest_of_them():
 
 
 def test_a_run_is_kept_and_its_table_written(quick, tmp_path):
-    readme = tmp_path / 'README.md'
+    readme = tmp_path / 'page.md'
     readme.write_text(f'before\n{BEGIN}\nlast year\n{END}\nafter\n', encoding='utf-8')
     files = update_readme(readme, quick)
-    assert (tmp_path / KEPT / 'control' / 'result.json') in files
+    assert (tmp_path / 'page' / 'control' / 'result.json') in files
     text = readme.read_text(encoding='utf-8')
     assert text.startswith('before\n') and text.endswith('\nafter\n')
     assert 'last year' not in text
@@ -95,7 +96,7 @@ def test_a_run_is_kept_and_its_table_written(quick, tmp_path):
 
 
 def test_a_readme_without_markers_is_left_alone(tmp_path):
-    readme = tmp_path / 'README.md'
+    readme = tmp_path / 'page.md'
     readme.write_text('no place', encoding='utf-8')
     with pytest.raises(MusculoskeletalError, match='results'):
         assert update_readme(readme) == [readme]
