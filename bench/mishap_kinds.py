@@ -831,8 +831,12 @@ def pushed(lab: Lab, rng: Rng) -> Case:
 
 def more_friction(lab: Lab, _: Rng) -> Case:
     """Dust doubles the friction of the tendons (`kin`) or of the joints (`foreign`)."""
-    lab.arm.set_friction(2.0)
-    return Case('× 2', lambda lab: lab.arm.set_friction(1.0), lasts=30.0)
+
+    def clean(lab: Lab) -> None:
+        lab.arm.friction[:] *= 0.5
+
+    lab.arm.friction[:] *= 2.0
+    return Case('× 2', clean, lasts=30.0)
 
 
 def stop_of_verification(lab: Lab, rng: Rng) -> Case:

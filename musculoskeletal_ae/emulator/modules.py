@@ -268,8 +268,6 @@ class Arm(ABC):
         self._drive_friction: Array = share * robot.description.tension.limit
         self._mount = self.faults.mount  # present turn of the base, as a rotation matrix
         self._wrench = np.zeros(6)
-        #: present friction of tendons or joints, as a multiple of the individual's own
-        self._friction_factor = 1.0
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
@@ -425,17 +423,8 @@ class Arm(ABC):
 
     @property
     @abstractmethod
-    def _varying_friction(self) -> Array:
-        """The friction coefficients that `set_friction` changes in place."""
-
-    def set_friction(self, factor: float) -> None:
-        """Set the friction of the tendons (`kin`) or of the joints (`foreign`).
-
-        `factor`, which is above 0, multiplies the individual's own friction.
-        """
-        friction = self._varying_friction
-        friction *= factor / self._friction_factor
-        self._friction_factor = factor
+    def friction(self) -> Array:
+        """Friction of the tendons (`kin`) or of the joints (`foreign`); may be changed in place."""
 
     def set_wrench(self, wrench: Array) -> None:
         """Set the force [N] and torque [N·m] on the end effector, in the root link's axes, (6,)."""

@@ -407,7 +407,8 @@ class ForeignArm(Arm):
         return friction
 
     @property
-    def _varying_friction(self) -> Array:
+    def friction(self) -> Array:
+        """Friction of the joints, which may be changed in place."""
         friction: Array = self._model.dof_frictionloss
         return friction
 

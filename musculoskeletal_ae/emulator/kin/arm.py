@@ -263,7 +263,8 @@ class EmulatedArm(modules.Arm):
         return self.individual.tendon_friction.copy()
 
     @property
-    def _varying_friction(self) -> Array:
+    def friction(self) -> Array:
+        """Friction μ of the tendons, which may be changed in place, shape (M,)."""
         return self.individual.tendon_friction
 
     def _turn_gravity(self, mount: Array) -> None:
