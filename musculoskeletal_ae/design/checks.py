@@ -32,7 +32,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.design.equilibria import Equilibria, equilibria, is_suspended
-from musculoskeletal_ae.design.route_jumps import jumping_muscles
+from musculoskeletal_ae.design.route_jumps import jumping_muscles, limit_without_jumps
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
@@ -524,10 +524,17 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
 
 def _jumping_muscles(robot: Robot) -> Iterator[CheckFinding]:
     """Yield a warning for each muscle whose length jumps where its tendon slips over an object."""
-    for m, size, theta in jumping_muscles(robot):
-        crossed, position = np.flatnonzero(robot.routes.crossed[m]), robot.units.to_position(theta)
-        place = ', '.join(f'{robot.joints[j]} {position[j]:.2f}' for j in crossed)
-        yield _finding('jumping_muscle', muscle=robot.muscles[m], size=1e3 * size, place=place)
+    for jump in jumping_muscles(robot):
+        low, high = jump.theta.min(axis=0), jump.theta.max(axis=0)
+        place = ', '.join(
+            f'{robot.joints[j]} from {robot.units[j].range_text(low[j], high[j])}'
+            for j in np.flatnonzero(robot.routes.crossed[jump.muscle])
+        )
+        limit = limit_without_jumps(robot, jump)
+        yield _finding(
+            'jumping_muscle', muscle=robot.muscles[jump.muscle], size=1e3 * jump.size, place=place,
+            limit=f'limit {limit}, or ' if limit else '',
+        )  # fmt: skip
 
 
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[CheckFinding]:

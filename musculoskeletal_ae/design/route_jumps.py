@@ -7,10 +7,11 @@ centimetres. No network can represent such a jump.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 
 LINES = 60  # examine lengths along this many straight lines between random postures
@@ -25,24 +26,25 @@ RANGE_MARGIN = 0.03
 MOST_DRAWS = 50
 
 
-def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the largest jump of each length [m], (M,), and where it occurs: θ [rad], (M, D).
+class Jump(NamedTuple):
+    """A muscle whose length jumps somewhere within the joint limits."""
 
-    Args:
-        lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
-        lower: Lower joint limits [rad], (D,).
-        upper: Upper joint limits [rad], (D,).
-    """
-    bends, theta = _second_differences(lengths, lower, upper)
-    return bends.max(axis=0), theta[bends.argmax(axis=0)]
+    muscle: int  # index of the muscle
+    size: float  # its largest jump [m]
+    theta: Array  # postures of its jumps [rad], (N, D)
 
 
-def _second_differences(
+def second_differences(
     lengths: Callable[[Array], Array], lower: Array, upper: Array
 ) -> tuple[Array, Array]:
     """Return absolute second differences of lengths along random lines in joint space.
 
     They are small where a length is smooth, and large where it jumps.
+
+    Args:
+        lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
+        lower: Lower joint limits [rad], (D,).
+        upper: Upper joint limits [rad], (D,).
 
     Returns:
         The differences [m], (N, M), and the posture in the middle of each [rad], (N, D).
@@ -62,7 +64,8 @@ def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
         lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
         robot: The geometric model, for its joint limits.
     """
-    return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
+    jumps: Bools = second_differences(lengths, robot.lower, robot.upper)[0].max(axis=0) > JUMP
+    return jumps
 
 
 def newly_jumping(
@@ -80,16 +83,16 @@ def newly_jumping(
     return jump & ~jumping(nominal, robot) if jump.any() else jump
 
 
-def jumping_muscles(robot: Robot) -> list[tuple[int, float, Array]]:
-    """Find the muscles whose length jumps somewhere within the joint limits.
-
-    Returns:
-        For each of them, the index, the largest jump [m], and the posture of this jump [rad], (D,).
-    """
+def jumping_muscles(robot: Robot) -> list[Jump]:
+    """Find the muscles whose length jumps somewhere within the joint limits."""
     if robot.routes.objects is None:
         return []
-    largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
-    return [(m, largest[m], where[m]) for m in np.flatnonzero(largest > JUMP).tolist()]
+    bends, theta = second_differences(robot.routes.absolute_lengths, robot.lower, robot.upper)
+    largest = bends.max(axis=0)
+    return [
+        Jump(m, largest[m], theta[bends[:, m] > JUMP])
+        for m in np.flatnonzero(largest > JUMP).tolist()
+    ]
 
 
 def jump_warning(robot: Robot) -> str:
@@ -103,61 +106,21 @@ def jump_warning(robot: Robot) -> str:
     return f'{problem}: {", ".join(each)}; `check_robot` prints where they jump'
 
 
-def jump_choices(robot: Robot) -> list[str]:
-    """Return lines for the user that say where muscle lengths jump, and which remedies there are.
+def limit_without_jumps(robot: Robot, jump: Jump) -> str:
+    """Limit one joint so that a length does not jump; return its new limits as a suggestion.
 
-    For each muscle whose length jumps, one line states the joint angles. A second line suggests
-    limits of a joint that exclude the jump, if there are any. The last line lists all remedies.
-    Without jumps, the list is empty.
-    """
-    if robot.routes.objects is None:
-        return []
-    bends, theta = _second_differences(robot.routes.absolute_lengths, robot.lower, robot.upper)
-    lines, jumping_names = [], []
-    for m in np.flatnonzero(bends.max(axis=0) > JUMP).tolist():
-        there = theta[bends[:, m] > JUMP]
-        crossed = np.flatnonzero(robot.routes.crossed[m])
-        place = ', '.join(
-            f'{robot.joints[j]} from '
-            f'{robot.units[j].range_text(there[:, j].min(), there[:, j].max())}'
-            for j in crossed
-        )
-        size, name = 1e3 * bends[:, m].max(), robot.muscles[m]
-        jumping_names.append(name)
-        lines.append(
-            f'length jump: the length of muscle {name} jumps by up to {size:.0f} mm for {place}'
-        )
-        if limit := _limit_without_jumps(robot, there, crossed):
-            lines.append(f'    limiting {limit} excludes this jump')
-    if lines:
-        together = ','.join(jumping_names)
-        lines.append(
-            'no network can represent lengths that jump. Limit a joint (in the source, or in '
-            f'robot.urdf), leave the muscles out (--without {together}), or accept that estimates '
-            'are wrong near the postures of a jump and that nodes may reject the network'
-        )
-    return lines
-
-
-def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Limit one joint so that no length jumps; return its new limits as a suggestion.
-
-    Of all joints, the one is chosen that keeps the largest share of its range.
-
-    Args:
-        robot: The geometric model.
-        there: Postures of the jumps [rad], (N, D).
-        crossed: Indices of the joints that may be limited.
+    Of all joints that the muscle crosses, the one is chosen that keeps the largest share of its
+    range.
 
     Returns:
         A text with the name of the joint and its new limits; '' if each joint would keep less than
         30 % of its range.
     """
     best, text = LEAST_RANGE, ''
-    for j in crossed:
+    for j in np.flatnonzero(robot.routes.crossed[jump.muscle]):
         low, high = robot.lower[j], robot.upper[j]
         margin = RANGE_MARGIN * (high - low)
-        least, most = there[:, j].min() - margin, there[:, j].max() + margin
+        least, most = jump.theta[:, j].min() - margin, jump.theta[:, j].max() + margin
         for kept in ((low, least), (most, high)):
             share = (kept[1] - kept[0]) / (high - low)
             if share > best:

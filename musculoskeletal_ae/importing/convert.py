@@ -10,7 +10,6 @@ from xml.etree import ElementTree as ET
 
 from musculoskeletal_ae.design.checks import RobotCheck, check_robot
 from musculoskeletal_ae.design.prospects import prospects
-from musculoskeletal_ae.design.route_jumps import jump_choices
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import file_error, new_directory, read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
@@ -132,10 +131,12 @@ def run(args: Namespace) -> int:
     print(length_verdict(comparison))
     if comparison is not None and comparison.lengths:
         print(arm_verdict(comparison))
-    for line in jump_choices(robot):
-        print(line)
+    check = check_robot(robot)
+    for finding in check.warnings:
+        if finding.kind == 'jumping_muscle':  # its remedies change the source or the import
+            print(f'warning: {finding.message}; {finding.remedy}')
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
-    print(check_verdict(check_robot(robot)))
+    print(check_verdict(check))
     return 0
 
 

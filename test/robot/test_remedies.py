@@ -195,6 +195,16 @@ def end_of_drum(end):
     return edited(edit)
 
 
+def limit_as_stated(directory, finding):
+    """Give the joint of a remedy the limits that the remedy states."""
+    joint, *limits = re.match(r'limit (\w+) to the range (.*) to (.*) rad', finding.remedy).groups()
+    file = directory / 'robot.urdf'
+    start, end = file.read_text().split(f'<joint name="{joint}"')
+    for name, limit in zip(('lower', 'upper'), limits, strict=True):
+        end = re.sub(f'{name}=".*?"', f'{name}="{limit}"', end, count=1)
+    file.write_text(f'{start}<joint name="{joint}"{end}')
+
+
 def without_mass(directory):
     """Remove the masses of the links that the joint `bend` carries."""
     file = directory / 'robot.urdf'
@@ -287,6 +297,14 @@ ROWS = {
         lambda directory: behind_a_drum(directory, DRUM_ENDS['jumps']),
         'move the side of that wrap, or a neighbouring point, until the tendon stays on one side',
         [drum(side=[-0.2, 0.0, -0.33]), end_of_drum(DRUM_ENDS['stays'])],
+    ),
+    'jumping_muscle, limit': Row(
+        lambda directory: behind_a_drum(directory, DRUM_ENDS['jumps']),
+        'limit bend to the range ', [limit_as_stated],
+    ),
+    'jumping_muscle, left out': Row(
+        lambda directory: behind_a_drum(directory, DRUM_ENDS['jumps']),
+        'leave the muscle out (import_robot --without straightener)', [removed('straightener')],
     ),
     'idle_object': Row(
         arm26(with_object(radius=30.0)), 'check that centre and radius are in metres',
