@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from bench.learned_arm import initial
+from bench.learned_arm import Never, initial
 from bench.regression import BASELINES
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.body_fit import BodyFit
@@ -49,7 +49,6 @@ from musculoskeletal_ae.learning.detector_calibration import Healthy
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import CAPACITY
 from musculoskeletal_ae.learning.scheduler import Job, Update
-from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
@@ -75,12 +74,6 @@ class Case(NamedTuple):
     training: Observations
     test: Observations
     healthy: Healthy
-
-
-class Never(Trainer):
-    """A trainer that never updates the network, so that the bench decides when to update."""
-
-    ready = False
 
 
 def _observed(theta: Array, tension: Array, length: Array) -> Observations:

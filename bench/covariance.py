@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.learned_arm import add_initial, initial_network
+from bench.learned_arm import Never, add_initial, initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.covariance import ellipsoids
 from musculoskeletal_ae.control.settings import Settings, Setup
@@ -45,7 +45,6 @@ from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.collector import NONE, SENSOR
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.scheduler import Job
-from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.options import Parser, names, number
@@ -87,12 +86,6 @@ def honesty(covariance: Array, error: Array) -> Honesty:
         float((ellipsoids(covariance, error) <= 1.0).mean()),
         float(squares.mean()) / error.shape[1],
     )
-
-
-class Never(Trainer):
-    """A trainer that never updates the network, so that the bench decides when to update."""
-
-    ready = False
 
 
 def learned(robot: Robot, driver: Mae, exploring: Recording, seed: int, source: str) -> Mae:

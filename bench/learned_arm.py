@@ -42,6 +42,12 @@ class Seldom(Trainer):
         return True
 
 
+class Never(Trainer):
+    """A trainer that never updates the network, so that the bench decides when to update."""
+
+    ready = False
+
+
 class LearnedArm(NamedTuple):
     """The network of a learned individual, the network that commanded it, and the recorded data."""
 

@@ -248,7 +248,9 @@ class MotionTest(ABC):
                     'of these muscles, too'
                 )
             return
-        verdict.passed_some('order', [m for m in self._muscles if m in order.right])
+        for m in self._muscles:
+            if m in order.right:
+                verdict.passed('order', m)
         highest = float(self._highest.max())
         higher = min(1.5 * highest, float(robot.tension.limit.min()))
         again = f'Repeat the test with --tension {higher:.0f}, or move'

@@ -81,11 +81,6 @@ class Verdict:
             if self._state[m, CHECKS.index(check)] == OPEN:
                 self._state[m, CHECKS.index(check)] = OK
 
-    def passed_some(self, check: str, muscles: Sequence[int]) -> None:
-        """Record that some muscles, or none, passed a check, unless they have failed it."""
-        for m in muscles:
-            self.passed(check, m)
-
     def has_passed(self, check: Check, m: int) -> bool:
         """Return whether muscle m passed a check."""
         return bool(self._state[m, CHECKS.index(check)] == OK)

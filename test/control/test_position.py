@@ -14,13 +14,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from readings import reading
 from robots import with_modules
+from sensor_loop import WithJointSensors
 
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
 from musculoskeletal_ae.control.stop_commands import PAYING_OUT, SafeStop
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
-from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.motion.tension_plan import plan_at_rest
@@ -175,17 +175,6 @@ def test_the_length_command_is_the_length_itself():
     )
     plan = plan_at_rest(ROBOT, mae, THETA)
     np.testing.assert_allclose(plan.length(mae, THETA), mae.lengths(THETA, plan.bone_tension))
-
-
-class WithJointSensors(ClosedLoop):
-    """A loop in which joint sensors replace the estimate."""
-
-    def use(self, mae):
-        self.mae = mae
-        self.core.use(mae)
-
-    def estimate(self, read, now):  # noqa: ARG002
-        return read.theta
 
 
 @cache

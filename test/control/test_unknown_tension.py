@@ -8,6 +8,7 @@ import pytest
 from exact_mae import ExactMae
 from readings import reading
 from robots import with_modules, write_robot
+from sensor_loop import WithJointSensors
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
@@ -15,7 +16,6 @@ from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
-from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.learning.collector import NONE
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.motion.activities import LENGTH
@@ -26,15 +26,6 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 KNOWN = Robot.load('arm26')
 ROBOT = Robot(with_modules(KNOWN.description, actuation='position', tension_source='none'))
 COUNT, THETA = ROBOT.muscle_count, np.array([-0.3, -1.0])
-
-
-class WithJointSensors(ClosedLoop):
-    def use(self, mae):
-        self.mae = mae
-        self.core.use(mae)
-
-    def estimate(self, read, now):  # noqa: ARG002
-        return read.theta
 
 
 @pytest.fixture(scope='module')

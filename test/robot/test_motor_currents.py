@@ -8,13 +8,13 @@ import pytest
 from exact_mae import ExactMae
 from readings import reading
 from robots import read_muscles, with_modules, write_muscles, write_robot
+from sensor_loop import WithJointSensors
 
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
-from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.muscle_states import read_muscle_states
@@ -134,15 +134,6 @@ def test_the_driver_check_accepts_currents_and_names_wrong_units():
         verdicts[unit] = listening.verdict(1.0)
     assert not verdicts['A'].faults
     assert 'current' in str(verdicts['mA']) and 'publish A' in str(verdicts['mA'])
-
-
-class WithJointSensors(ClosedLoop):
-    def use(self, mae):
-        self.mae = mae
-        self.core.use(mae)
-
-    def estimate(self, read, now):  # noqa: ARG002
-        return read.theta
 
 
 def test_the_arm_reaches_a_target_and_no_tendon_is_overloaded_before_anything_is_learned():
