@@ -660,7 +660,8 @@ def _interpretations(
         published: The published values.
     """
     yield '', {}, published
-    yield 'kelvin', {}, published.replace(temperature=published.temperature - 273.15)
+    celsius = published.temperature - 273.15
+    yield 'temperature unit', {'unit': 'K'}, published.replace(temperature=celsius)
     # Only the rows that each message has can be in another order.
     expected = [each for each in QUANTITIES if each.presence is not Presence.OPTIONAL]
     rows = [each.of(published) for each in expected]

@@ -77,9 +77,6 @@ EXCEPTIONS = {
     'type': 'needs the graph of ROS: test/nodes/test_check_driver.py',
     'deaf': 'needs the graph of ROS: test/nodes/test_check_driver.py',
     'silence': 'needs the graph of ROS: test/nodes/test_check_driver.py',
-    'muscle_states: refused': 'no message causes it, because each reason has its own advice',
-    'joint_states: refused': 'no message causes it, because each reason has its own advice',
-    'motors: refused': 'no message causes it, because each reason has its own advice',
 }
 
 
@@ -180,11 +177,11 @@ SOUND = states(lambda _: None)
 STATES = {
     'not finite': (states(not_finite), 'publish finite values only', [SOUND]),
     'wrong length': (lambda rows, _: array(rows[:2]), '3×M values', [SOUND]),
-    'empty': (edited(data=np.zeros(0)), 'fill `data` with 3×M values', [SOUND]),
+    'empty': (edited(data=np.zeros(0)), '3×M values', [SOUND]),
     'oversized': (edited(data=np.zeros(10_001)), '3×M values', [SOUND]),
     'wrong layout': (
         with_layout(('row', 3, 18), ('muscle', M, M), offset=1),
-        "('quantity', 3, 3M), ('muscle', M, M), or empty; data_offset is 0",
+        "('quantity', 3, 3M), ('muscle', M, M), or empty, and data_offset is 0",
         [with_layout(('quantity', 3, 3 * M), ('muscle', M, M)), with_layout()],
     ),
 }
@@ -210,7 +207,7 @@ JOINT_STATES = {
     ),
     'wrong length': (
         angles(position=[], velocity=[0.0, 0.0]),
-        'fill `position`, one value for each name; `velocity` and `effort` may be empty',
+        'one entry per joint, each joint once; `velocity` and `effort` may be empty',
         [angles(), angles(velocity=[0.0, 0.0])],
     ),
     'empty': (angles(name=[], position=[]), 'fill `name` and `position`', [angles()]),
@@ -221,7 +218,7 @@ JOINT_STATES = {
     ),
     'duplicate joint': (
         angles(name=['elbow', 'elbow'], position=[1.0, 1.0]),
-        'name each joint once',
+        'each joint once',
         [angles()],
     ),
     'missing joint': (
@@ -269,12 +266,12 @@ MOTOR_STATES = {
     'empty': (motors(name=[], position=[], effort=[]), 'fill `name`, `position` and `effort`', []),
     'oversized': (
         motors(name=['a'] * 10_001, position=[0.0] * 10_001, effort=[]),
-        'publish the joints of this robot only',
+        'each motor of this robot once',
         [],
     ),
-    'wrong length': (motors(position=[]), 'one value for each name', []),
+    'wrong length': (motors(position=[]), 'fill `name`, `position` and `effort`', []),
     'missing motor': (of_motors(rename), 'list all motors in one joint_state_broadcaster', []),
-    'duplicate motor': (of_motors(twice), 'name each motor once', []),
+    'duplicate motor': (of_motors(twice), 'each motor of this robot once', []),
     'no stamp': (of_motors(no_stamp), 'set header.stamp to the time of the reading', []),
     'repeated stamp': (of_motors(one_stamp), 'publish each reading once, with its own stamp', []),
     'not finite': (motors(effort=[]), 'add this state interface to the hardware component', []),
@@ -314,6 +311,11 @@ MESSAGES = {
 }
 
 
+def fault_of(message):
+    """Return the name of the fault that a message causes."""
+    return message if message in FAULTS else f'{message.partition(": ")[0]}: refused'
+
+
 @pytest.mark.parametrize('name', MESSAGES)
 def test_a_message_is_accepted_after_the_change(name):
     wrong, advice, changed, topic = MESSAGES[name]
@@ -324,7 +326,8 @@ def test_a_message_is_accepted_after_the_change(name):
         return judged(message, angles(), connected() if topic == 'motors' else None)
 
     (fault, *_) = verdict(wrong).faults
-    assert fault.name == name and advice in fault.change
+    assert fault.name == fault_of(name) and advice in fault.change
+    assert name.partition(': ')[2] in fault.observation  # the reason
     for message in changed or [motors()]:
         assert not verdict(message).faults, str(verdict(message))
 
@@ -593,7 +596,7 @@ HEARD = {
     'by muscle': Heard(
         publishing(lambda rows: rows.T.reshape(3, M)), 'publish 3 rows', [to_rows]
     ),
-    'kelvin': Heard(
+    'temperature unit, K': Heard(
         publishing(lambda rows: rows + [[0], [0], [273.15]]), 'publish °C', [to_celsius]
     ),
     'length unit': Heard(publishing(scaled(1000, 1, 1)), 'publish m', [to_unit(LENGTH, 'mm')]),
@@ -1164,7 +1167,7 @@ def test_a_fault_that_the_motion_test_finds_is_gone_after_the_change(name):
 
 
 def test_every_fault_has_a_row_or_a_reason():
-    tried = {key.partition(', ')[0] for key in [*HEARD, *WOUND]} | MESSAGES.keys()
+    tried = {key.partition(', ')[0] for key in [*HEARD, *WOUND]} | {*map(fault_of, MESSAGES)}
     tried |= {'silent', 'joint sign or order'}  # tests of their own
     assert tried.isdisjoint(EXCEPTIONS)
     assert tried | EXCEPTIONS.keys() == FAULTS.keys()
