@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain, combinations, permutations
+from itertools import permutations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -28,6 +28,7 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot import model_errors
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
+from musculoskeletal_ae.signals.joint_sensors import JointFault
 from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
@@ -75,10 +76,8 @@ SLOPES = 0.2, 2.2
 #: count a column of an arm at rest as misplaced only if another muscle fits better by this factor
 BETTER_AT_REST = 2.5
 MOVED = 0.04  # check sign and scale of l only if it has varied by more than this [m]
-#: blame the joint sensors if correcting their angles leaves at most this fraction of the misfit;
-#: otherwise, blame the lengths
-JOINTS_BETTER = 0.8
-MOVED_JOINT = 0.2  # check the sign of θ only if its range is larger than this [rad]
+#: judge sign and order of the joint sensors only if the range of some θ is larger than this [rad]
+MOVED_JOINT = 0.2
 MOST_SAMPLES = 400  # compare at most this many messages with the model, to save time
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
@@ -389,8 +388,8 @@ class Listening:
     ) -> None:
         """Judge lengths and joint sensors by the model, and find which of them have faults.
 
-        If several lengths have faults, and a single fault of the joint sensors explains all of
-        them, only that fault is reported.
+        If several lengths have faults, and faults of the joint sensors explain all of them, only
+        the latter are reported.
 
         Args:
             verdict: Receives the results.
@@ -398,133 +397,53 @@ class Listening:
             length: Muscle lengths l [m], (N, M).
             tension: Tensions T [N], (N, M).
         """
-        lengths_verdict = Verdict(self._robot)
-        misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
-        is_suspect = sum(len(fault.muscles) for fault in lengths_verdict.faults) > 1
-        if is_suspect:
-            best, explanation = JOINTS_BETTER * misfit, None
-            for what, names, meant in self._angles(theta):
-                other = Verdict(self._robot)
-                remaining = self._judge_lengths(other, meant, length, tension)
-                # The misfit must fall clearly, because lengths of wrong sign look much like angles
-                # of wrong sign.
-                if what == 'degrees' and not self._explains_motion(meant, length, tension):
-                    continue
-                if not other.faults and remaining < best:
-                    best, explanation = remaining, (what, names)
-            if explanation is not None:
-                what, names = explanation
-                verdict.failed(what, names=', '.join(names))
+        lengths, sensors = Verdict(self._robot), joint_sensors.Judgement([], ())
+        self._judge_lengths(lengths, theta, length, tension)
+        if not self._stated:
+            sensors = joint_sensors.judge(self._robot, theta, length, tension)
+        # At rest, too many signs and orders of joints could explain the lengths.
+        has_moved = not self._stated and bool((np.ptp(theta, axis=0) > MOVED_JOINT).any())
+        faults = [
+            each for each in sensors.faults if has_moved or each.kind == joint_sensors.DEGREES
+        ]
+        # Without zeros, lengths of wrong sign look like angles of wrong sign.
+        are_turned = not self._zeroed and any(each.name == 'all signs' for each in lengths.faults)
+        is_suspect = sum(len(fault.muscles) for fault in lengths.faults) > 1
+        if faults and is_suspect and not are_turned:
+            others = Verdict(self._robot)
+            meant = joint_sensors.corrected(theta, faults, self._robot.units)
+            self._judge_lengths(others, meant, length, tension)
+            if not others.faults:
+                self._report_sensors(verdict, faults, lengths)
                 return
-            # A single wrong angle makes several lengths look wrong, so name the angle first.
-            names = self._suspected_signs(theta, length, tension)
-            if names and self._look_exchanged(lengths_verdict, theta):
-                # On a symmetric arm, the reversed sign of one joint sensor looks like several
-                # exchanged muscles. One fault is more likely than several.
-                columns = chain.from_iterable(fault.muscles for fault in lengths_verdict.faults)
-                muscles = ', '.join(self._robot.muscles[m] for m in columns)
-                verdict.failed('joint sign or order', names=' or '.join(names), muscles=muscles)
-                return
-            if names:
-                lengths_verdict.notes.append(
-                    f'all lengths would fit if the sign of the angle of {" or ".join(names)} were '
-                    'reversed: check these joint sensors first'
-                )
-        elif not lengths_verdict.faults:
-            self._judge_joint_signs(verdict, theta, length, tension)
-        verdict.add(lengths_verdict)
+        if has_moved and not lengths.faults:
+            verdict.notes += joint_sensors.sign_notes(
+                self._robot, sensors.right, 'Move the arm by hand through its whole range'
+            )
+        verdict.add(lengths)
 
-    def _explains_motion(self, theta: Array, length: Array, tension: Array) -> bool:
-        """Return whether θ [rad], (N, D), changes enough to explain the changes of l, (N, M).
-
-        Angles in radians that are taken for degrees hardly change, although the arm moves.
-        """
-        change = np.ptp(length, axis=0)
-        least = change / (2.0 * SLOPES[1])
-        has_moved = change > MOVED
-        model = np.ptp(self._robot.muscle_lengths(theta, tension), axis=0)
-        return bool((model >= least)[has_moved].all())
-
-    def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return the joints of which a reversed sign alone would explain all wrong lengths.
-
-        Arguments are joint angles [rad], (N, D), lengths [m] and tensions [N], (N, M) each.
-        """
-        names = []
-        for j, name in enumerate(self._robot.joints):
-            turned, other = theta.copy(), Verdict(self._robot)
-            turned[:, j] *= -1.0
-            self._judge_lengths(other, turned, length, tension)
-            if not other.faults:
-                names.append(name)
-        return names
-
-    def _look_exchanged(self, verdict: Verdict, theta: Array) -> bool:
-        """Return whether the joints moved, and more than two muscles look exchanged.
-
-        Args:
-            verdict: The faults of the lengths.
-            theta: Joint angles θ [rad], (N, D).
-        """
-        are_places = all(fault.name == 'place' for fault in verdict.faults)
-        return bool(self._moved(theta).any()) and are_places and len(verdict.faults) > 2
-
-    def _moved(self, theta: Array) -> Bools:
-        """Return which joints moved enough in θ [rad] (N, D) to check their signs, (D,)."""
-        moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT
-        return moved
-
-    def _judge_joint_signs(
-        self, verdict: Verdict, theta: Array, length: Array, tension: Array
+    def _report_sensors(
+        self, verdict: Verdict, faults: Sequence[JointFault], lengths: Verdict
     ) -> None:
-        """Judge the signs of the joint sensors, if a hand has moved the arm.
+        """Report the faults of joint sensors that explain all faults of lengths.
 
         Args:
             verdict: Receives the results.
-            theta: Joint angles θ [rad], (N, D).
-            length: Muscle lengths l [m], (N, M). No fault of lengths was found.
-            tension: Tensions T [N], (N, M).
-        """
-        if self._stated or not self._moved(theta).any():
-            return
-        right = joint_sensors.judge(self._robot, theta, length, tension).right
-        verdict.notes += joint_sensors.sign_notes(
-            self._robot, right, 'Move the arm by hand through its whole range'
-        )
-
-    def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
-        """Yield the postures that would be right if the joint sensors had a certain fault.
-
-        The faults are degrees instead of radians, the reversed sign of one joint or of all joints,
-        and two exchanged joints. Reversed and exchanged joints are considered only if the joints
-        moved, because too many of these faults could explain the lengths of an arm at rest.
-
-        Args:
-            theta: The published θ, (N, D).
-
-        Yields:
-            The name of the fault, the names of the affected joints, and the corrected θ [rad],
-            (N, D).
+            faults: The faults of the joint sensors.
+            lengths: The faults that the lengths seem to have.
         """
         robot = self._robot
-        joints = range(robot.joint_count)
-        turning = [j for j in joints if not robot.units.slides[j]]
-        if np.abs(theta[:, turning]).max(initial=0.0) > math.pi:
-            degrees = theta.copy()
-            degrees[:, turning] = np.radians(degrees[:, turning])
-            yield 'degrees', [robot.joints[j] for j in turning], degrees
-        moved = self._moved(theta)
-        for j in np.flatnonzero(moved).tolist():
-            turned = theta.copy()
-            turned[:, j] *= -1.0
-            yield 'joint sign', [robot.joints[j]], turned
-        if moved.sum() > 1:
-            yield 'joint sign', [robot.joints[j] for j in joints], -theta
-        for j, k in combinations(np.flatnonzero(moved).tolist(), 2):
-            exchanged = joint_sensors.corrected(
-                theta, [joint_sensors.JointFault(joint_sensors.ORDER, (j, k))], robot.units
-            )
-            yield 'joint order', [robot.joints[j], robot.joints[k]], exchanged
+        # On a symmetric arm, the reversed sign of one joint sensor looks like several exchanged
+        # muscles. One fault is more likely than several.
+        look_exchanged = len(lengths.faults) > 2
+        look_exchanged &= all(fault.name == 'place' for fault in lengths.faults)
+        muscles = ', '.join(robot.muscles[m] for each in lengths.faults for m in each.muscles)
+        for fault in faults:
+            names = ', '.join(robot.joints[j] for j in fault.joints)
+            if fault.kind == joint_sensors.SIGN and look_exchanged:
+                verdict.failed('joint sign or order', names=names, muscles=muscles)
+            else:
+                verdict.failed(fault.kind, names=names)
 
     def _are_turned(self, length: Array, model: Array, moved: Bools) -> bool:
         """Return whether the driver publishes the lengths of all muscles with the wrong sign.
@@ -545,9 +464,7 @@ class Listening:
         misfits = int((literal > model_errors.LARGEST).sum())
         return self._zeroed and bool((turned <= model_errors.LARGEST).all()) and misfits > 1
 
-    def _judge_lengths(
-        self, verdict: Verdict, theta: Array, length: Array, tension: Array
-    ) -> float:
+    def _judge_lengths(self, verdict: Verdict, theta: Array, length: Array, tension: Array) -> None:
         """Judge the lengths by the geometric model, and report their faults.
 
         Args:
@@ -555,11 +472,6 @@ class Listening:
             theta: Joint angles θ [rad], (N, D).
             length: Muscle lengths l [m], (N, M).
             tension: Tensions T [N], (N, M).
-
-        Returns:
-            The differences between l and the model [m], summed over the muscles, after exchanging
-            the columns of l or reversing their signs such that they fit best. ∞ if θ is beyond the
-            joint limits.
         """
         robot = self._robot
         # Judge the message that few others exceed, not a single extreme.
@@ -571,7 +483,7 @@ class Listening:
             at, off = robot.units.to_position(np.array([theta[judged[j], j], beyond[j]]), j)
             values = {'theta': at, 'beyond': off, 'unit': robot.units[j].position}
             verdict.failed('joint', name=robot.joints[j], **values)
-            return math.inf
+            return
         model = robot.muscle_lengths(theta, tension)
         # Position-controlled modules hold their lengths even if a hand moves the joints, so l never
         # counts as moved.
@@ -603,7 +515,7 @@ class Listening:
         all_turned = inverse[compared].sum() < fit[rows, best][compared].sum()
         if all_turned and self._are_turned(length, model, moved):
             verdict.failed('all signs', *range(len(own)), doubt=doubt)
-            return float(np.minimum(fit[rows, best], inverse).sum())
+            return
         by_hand = 'move the arm by hand while check_driver listens, without --move'
         if self._stated:
             by_hand = f'publish joint_states of all joints, and {by_hand}'
@@ -643,7 +555,6 @@ class Listening:
                 is_movable = robot.actuation.choose(not self._stated, False)
                 what = 'zero at rest' if is_movable and not moved[m] else 'zero'
                 verdict.failed(what, m, off=1e3 * off)
-        return float(np.minimum(fit[rows, best], inverse).sum())
 
 
 def _interpretations(

@@ -307,8 +307,10 @@ def _possible_faults(lengths: _Lengths, theta: Array) -> list[JointFault]:
     faults = list[JointFault]()
     if far:  # readings beyond the limits may be legal with the other sign, or as degrees
         faults.append(JointFault(SIGN, tuple(far)))
-        degrees = sorted({*far} & {*turning}), turning
-        faults += [JointFault(DEGREES, tuple(joints)) for joints in degrees if joints]
+        # In degrees, an arm that moves has readings far beyond ±π.
+        if np.abs(theta[:, turning]).max(initial=0.0) > np.pi:
+            degrees = sorted({*far} & {*turning}), turning
+            faults += [JointFault(DEGREES, tuple(joints)) for joints in degrees if joints]
     pairs = list(combinations(np.flatnonzero(lengths.moved(theta)).tolist(), 2))
     if pairs:  # state only the best exchange, because the caller's search for signs takes time
         exchanges = [JointFault(ORDER, pair) for pair in pairs]
