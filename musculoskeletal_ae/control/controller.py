@@ -56,7 +56,7 @@ from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
+from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
@@ -122,6 +122,7 @@ class Activities:
         if self.entered is not None:
             self.entered.leave()
         self.entered = None
+        self.follower.leave()  # discards a trajectory that has not begun, too
 
     def step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
         """Switch to the activity `control` if another one was active, and return its command."""
@@ -298,10 +299,7 @@ class Controller:
         """Stop the arm while an anomaly is present; resume after the verification of a suspect."""
         if body.has_anomaly:
             self.stop(ConditionKind.ANOMALY)
-        if body.anomaly is Anomaly.ENDED:
-            self.supervisor.on_verified()
-        else:
-            self.supervisor.on_suspect(body.anomaly is Anomaly.VERIFYING)
+        self.supervisor.on_anomaly(body.anomaly)
 
     def _use_offsets(self, body: BodyState) -> None:
         before = self.stream.body.offsets
@@ -449,12 +447,13 @@ class Controller:
             known = self.stream.body.offsets.known
             exploring = Activity.EXPLORING if known else Activity.CALIBRATING
             self._request(exploring if wanted else Activity.IDLE)
-        elif not wanted:  # an exploration that a stop has interrupted must not resume
-            self.supervisor.on_request(self.supervisor.activity)
+        elif not wanted:
+            self.supervisor.awaits_exploration = False
         return ''
 
     def stop(self, cause: ConditionKind, detail: str = '') -> None:
         """Stop the arm for a cause, with an optional detail; the stop lasts until `reset`."""
+        self.activities.leave()  # a reset before the next step must not continue a trajectory
         self.supervisor.on_event(cause.condition(detail))
 
     def reset(self, now: float) -> Condition | None:
@@ -514,10 +513,6 @@ class Controller:
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
             self.activities.entered, self._awaited_samples = None, WINDOW
         present = self.stop_conditions(now)
-        stale_estimate = any(each.kind is ConditionKind.STALE_ESTIMATE for each in present)
-        # If estimates are missing, the estimator may have restarted without the suspect.
-        if stale_estimate:
-            self.supervisor.on_suspect(False)
         if self.limiter.command is not None or not self.supervisor.is_running:
             # Before the first command, causes do not stop the arm, because it does not move yet.
             self.supervisor.on_conditions(present, step.elapsed, self.stopping.is_releasing)
@@ -656,7 +651,10 @@ class Controller:
         waits = not self.supervisor.is_latched and not present
         causes = {condition.kind for condition in present}
         is_fresh = ConditionKind.STALE_MUSCLE_STATES not in causes
-        suspect = self.stream.body.verified if self.supervisor.may_wind_suspect else None
+        # While estimates are missing, the estimator does not judge the suspect.
+        is_judged = ConditionKind.STALE_ESTIMATE not in causes
+        winds = self.supervisor.may_wind_suspect and is_judged
+        suspect = self.stream.body.verified if winds else None
         at_once = self.supervisor.releases_at_once
         return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, suspect, at_once)
 

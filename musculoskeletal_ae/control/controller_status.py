@@ -115,9 +115,8 @@ def _stop(core: Controller, now: float) -> Iterator[Condition]:
 
 def _exploration(core: Controller) -> Iterator[Condition]:
     """Yield why the arm does not explore although it should, and what starts the exploration."""
-    supervisor = core.supervisor
-    known, resumes = core.stream.body.offsets.known, supervisor.will_resume_exploring
-    if supervisor.awaits_exploration and not resumes:
+    supervisor, known = core.supervisor, core.stream.body.offsets.known
+    if supervisor.lacks_exploration:
         step = Step.EXPLORE if known else Step.EXPLORE_GENTLY
         yield ConditionKind.NOT_EXPLORING.condition(steps=[step])
     elif not known and supervisor.is_running and not supervisor.explores:
@@ -162,7 +161,7 @@ def _heat(core: Controller) -> Iterator[Condition]:
 
 
 def _missing_torque(core: Controller) -> Array | None:
-    control = core.activities.of(core.supervisor.activity)
+    control = core.activities.entered
     return None if control is None else control.missing_torque
 
 

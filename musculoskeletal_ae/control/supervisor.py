@@ -4,8 +4,8 @@
 The *activity* is what the arm does, or will do after a stop. The *stop state* determines whether
 the arm may do this. `TRANSITIONS` is the complete table of changes of the stop state; no other code
 changes it. Activity and stop state together give the mode that users see. In addition, the
-supervisor remembers whether an exploration was interrupted or refused, and the causes of the
-present stop.
+supervisor remembers whether an exploration is still to be started, and the causes of the present
+stop.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from enum import Enum
 
 from musculoskeletal_ae.conditions import Clears, Condition, ConditionKind
 from musculoskeletal_ae.remedy_steps import Step
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
 
@@ -50,20 +51,11 @@ class Event(Enum):
     CLEARED = 'no cause for 0.2 s'
     RELEASED = 'hold_time is over and the arm is released'
     SUSPECT = 'the estimator checks whether a suspect muscle is faulty'
-    NOT_VERIFIED = (
-        'the estimator has ended or checks no muscle, or another stop cause needs a reset'
-    )
+    NOT_VERIFIED = 'the estimator checks no muscle, or another stop cause needs a reset'
     VERIFIED = 'the check has ended the anomaly, and no stop cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
     RESET = 'controller/reset without a cause present'
 
-
-#: the activity after a latched stop, for each activity that the stop ends
-AFTER_A_STOP = {
-    Activity.MOVING: Activity.HOLDING,
-    Activity.EXPLORING: Activity.IDLE,
-    Activity.CALIBRATING: Activity.IDLE,
-}
 
 _S, _E = StopState, Event
 #: the complete table (state, event) → state; any other combination has no effect
@@ -90,20 +82,17 @@ class Supervisor:
 
     Attributes:
         activity: What the arm does, or will do after a stop.
-        explored: Whether a latched stop has interrupted an exploration that will resume if a
-            verification ends the stop. A request or a reset sets this to False.
-        awaits_exploration: Whether an exploration is still to be started, because a latched stop
-            has ended it or because it was refused at the start. A request sets this to False.
+        awaits_exploration: Whether an exploration is still to be started, because a reset has
+            ended it or because it was refused at the start. A request sets this to False.
         state: The stop state.
-        condition: The reported stop cause; None while running.
     """
 
     def __init__(self) -> None:
-        self.activity, self.explored = Activity.IDLE, False
+        self.activity = Activity.IDLE
         self.awaits_exploration = False
         self.state = StopState.RUNNING
-        self.condition: Condition | None = None
-        #: the latching causes since the stop began, with their newest details
+        #: the cause of a pause, or all causes that have latched the present stop with their newest
+        #: details; empty while running
         self._causes: dict[ConditionKind, Condition] = {}
         self._clear_for = 0.0  # time for which no cause of the stop has been present [s]
 
@@ -111,6 +100,11 @@ class Supervisor:
     def mode(self) -> str:
         """The identifier of the activity while the arm is running, otherwise of the stop state."""
         return (self.activity if self.state is StopState.RUNNING else self.state).value
+
+    @property
+    def condition(self) -> Condition | None:
+        """The reported stop cause, which is the first one of the stop; None while running."""
+        return next(iter(self._causes.values()), None)
 
     @property
     def is_running(self) -> bool:
@@ -130,13 +124,7 @@ class Supervisor:
     @property
     def releases_at_once(self) -> bool:
         """Whether a cause of the present stop demands to release the arm without delay."""
-        reported = () if self.condition is None else (self.condition.kind,)
-        return any(kind.releases_at_once for kind in (*self._causes, *reported))
-
-    @property
-    def will_resume_exploring(self) -> bool:
-        """Whether an interrupted exploration goes on by itself when this stop has ended."""
-        return self.explored and self.ends_by_itself
+        return any(kind.releases_at_once for kind in self._causes)
 
     @property
     def ends_by_itself(self) -> bool:
@@ -171,23 +159,20 @@ class Supervisor:
 
     @property
     def explores(self) -> bool:
-        """Whether the arm explores, or will continue to explore after a pause."""
+        """Whether the arm explores, or did so when the present stop began."""
         return self.activity in (Activity.EXPLORING, Activity.CALIBRATING)
+
+    @property
+    def lacks_exploration(self) -> bool:
+        """Whether the arm explores only after a new request, although it should explore."""
+        is_ended = self.is_latched and self.explores and not self.ends_by_itself
+        return self.awaits_exploration or is_ended
 
     # -- activity -------------------------------------------------------------------------------
 
     def on_request(self, activity: Activity) -> None:
-        """Change the activity; during a stop, the change takes effect after the stop.
-
-        After a latched stop, the arm may move to its last target and hold it, but must not start
-        an exploration or a trajectory by itself. Requests for these activities during such a stop
-        are therefore replaced according to `AFTER_A_STOP`. A request during a stop also prevents
-        an interrupted exploration from resuming.
-        """
-        if self.is_latched:
-            activity = AFTER_A_STOP.get(activity, activity)
-        self.activity, self.explored = activity, False
-        self.awaits_exploration = False
+        """Change the activity; during a stop, the change takes effect after the stop."""
+        self.activity, self.awaits_exploration = activity, False
 
     def on_offsets(self, known: bool) -> None:
         """Adapt the activity when the length offsets become `known`, or unknown.
@@ -210,8 +195,8 @@ class Supervisor:
     # -- stops ----------------------------------------------------------------------------------
 
     def on_event(self, condition: Condition) -> None:
-        """Stop because of a single event, such as a call of controller/stop."""
-        self._take([condition])
+        """Stop until a reset because of an event, such as a call of controller/stop."""
+        self._latch([condition])
 
     def on_conditions(self, present: Sequence[Condition], elapsed: float, released: bool) -> None:
         """Update the stop state from all causes that are present.
@@ -221,9 +206,15 @@ class Supervisor:
             elapsed: Time since the last call [s].
             released: Whether `hold_time` is over and the arm is released.
         """
+        latching = [each for each in present if each.kind.clears is not Clears.CONDITION]
+        if latching:
+            self._latch(latching)
+        elif present:
+            if self.is_running:
+                self._causes = {present[0].kind: present[0]}
+            self._fire(Event.CLEARING_CAUSE)
         if present:
             self._clear_for = 0.0
-            self._take(present)
         else:
             self._clear_for += elapsed
             self._fire(Event.NOTHING_PRESENT)
@@ -232,63 +223,43 @@ class Supervisor:
         if released:
             self._fire(Event.RELEASED)
 
-    def on_suspect(self, is_verified: bool) -> None:
-        """Start or abandon the verification of a suspect muscle.
+    def on_anomaly(self, anomaly: Anomaly) -> None:
+        """Begin, complete or abandon the verification of a suspect muscle.
 
-        `on_verified` ends a verification that is complete.
-
-        Args:
-            is_verified: True if the estimator verifies a suspect. False if it does not although it
-                has ended no anomaly, or if estimates are missing: the estimator may then have
-                restarted, and would no longer have a suspect.
+        If a verification has ended the anomaly, the arm resumes, unless a cause needs a reset. A
+        restarted estimator publishes that there is no anomaly, so that the verification is
+        abandoned.
         """
-        self._fire(Event.SUSPECT if is_verified else Event.NOT_VERIFIED)
-
-    def on_verified(self) -> None:
-        """Resume if a verification has ended the anomaly and no cause needs a reset."""
-        self._fire(Event.VERIFIED if self._is_verifiable else Event.NOT_VERIFIED)
+        if anomaly is Anomaly.VERIFYING:
+            self._fire(Event.SUSPECT)
+        elif anomaly is Anomaly.ENDED and self._is_verifiable:
+            self._fire(Event.VERIFIED)
+        else:
+            self._fire(Event.NOT_VERIFIED)
 
     def on_reset(self, present: Sequence[Condition]) -> Condition | None:
         """End the stop, and return None; if a cause is still present, return the first one instead.
 
-        In this case, the stop does not end.
+        In this case, the stop does not end. After the reset of a latched stop, the arm may move to
+        its last target and hold it, but explores only after a new request.
         """
         if present:
             return present[0]
-        self.explored = False
+        if self.is_latched and self.explores:
+            self.activity, self.awaits_exploration = Activity.IDLE, True
         self._fire(Event.RESET)
         return None
 
-    def _take(self, conditions: Sequence[Condition]) -> None:
-        latching = [each for each in conditions if each.kind.clears is not Clears.CONDITION]
-        if not latching:
-            if self.is_running:
-                self.condition = conditions[0]
-            self._fire(Event.CLEARING_CAUSE)
-            return
-        if not self.is_latched:
-            self.condition = latching[0]
+    def _latch(self, conditions: Sequence[Condition]) -> None:
+        if not self.is_latched:  # the cause of a pause does not latch the stop
             self._causes.clear()
-        self._causes |= {each.kind: each for each in latching}
+        self._causes |= {each.kind: each for each in conditions}
         self._fire(Event.LATCHING_CAUSE)
 
     def _fire(self, event: Event) -> None:
-        before, was_latched = self.state, self.is_latched
-        self.state = TRANSITIONS.get((before, event), before)
-        if self.state is before:
-            return
-        if self.state is StopState.RUNNING:
-            resumed = before is StopState.RESUMING and self.explored
-            self.condition, self.explored = None, False
+        self.state = TRANSITIONS.get((self.state, event), self.state)
+        if self.is_running:
             self._causes.clear()
-            if resumed:
-                self.activity, self.awaits_exploration = Activity.EXPLORING, False
-        elif self.is_latched and not was_latched:
-            self.explored = self.explores
-            self.awaits_exploration = self.awaits_exploration or self.explores
-            self.activity = AFTER_A_STOP.get(self.activity, self.activity)
-            if self.condition is not None:  # an auto-recoverable cause has become latched
-                self._causes[self.condition.kind] = self.condition
 
 
 def diagram() -> str:

@@ -15,6 +15,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import follower
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.exploration import Exploration
@@ -211,6 +212,27 @@ def test_after_reset_the_last_target_is_resumed_by_a_ramp(monkeypatch):
     np.testing.assert_allclose(bench.step(200)[-1].value, goal, atol=1e-9)
 
 
+@pytest.mark.parametrize('steps', [0, 1, 30])  # before and during the trajectory
+@pytest.mark.parametrize('delay', [0.0, 0.1])
+@pytest.mark.parametrize('stopped', [0, 30])
+def test_after_a_stop_no_trajectory_goes_on_from_where_it_was(steps, delay, stopped):
+    bench = settled(first_duration=3.0)
+    points = TrajectoryPoints(
+        np.arange(2), np.array([0.5, 1.0]), np.array([REST, OTHER]), None, None
+    )
+    bench.core.trajectory(points, delay)
+    bench.step(steps)
+    former = bench.follower.progress.latest
+    bench.stop()
+    bench.step(stopped)
+    assert bench.core.reset(bench.now) is None
+    bench.step()
+    resumed = bench.follower.progress.latest
+    assert resumed is not former and resumed.duration >= 3.0
+    np.testing.assert_array_equal(resumed.end, OTHER)
+    np.testing.assert_array_equal(resumed.start.theta, bench.theta)
+
+
 def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
     bench = Bench()
     assert bench.core.explore(True) == ''
@@ -220,10 +242,10 @@ def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
     assert not bench.core.supervisor.explores
     bench.core.explore(True)
     bench.stop()
-    assert not bench.core.supervisor.explores
     assert 'controller/stop' in bench.core.explore(True)
     assert bench.core.reset(bench.now) is None
-    assert bench.core.target_state.theta is None  # exploration is not resumed
+    assert not bench.core.supervisor.explores
+    assert bench.core.target_state.theta is None
 
 
 def test_exploration_started_again_continues_its_stream_of_postures():

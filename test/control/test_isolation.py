@@ -497,6 +497,20 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect(is_misse
     assert bench.core.reset(bench.now) is None
 
 
+def test_a_gap_of_estimates_interrupts_a_verification_and_does_not_latch_the_stop():
+    bench = VerificationBench(max_age=0.05)
+    bench.wound(round((bench.core.settings.hold_time + PAYING_OUT) / 0.01) + 3)
+    assert np.diff(bench.wound(3)).max() < 0.0
+    bench.blind = {'estimate'}
+    assert np.diff(bench.wound(50)[8:]).min() >= 0.0  # nobody would notice that it pulls
+    bench.blind = set()
+    assert np.diff(bench.wound(5)).max() < 0.0
+    assert bench.core.supervisor.mode == 'verifying'
+    bench.end_anomaly()
+    bench.step(2)
+    assert bench.cause == ''
+
+
 def test_a_verification_whose_suspect_is_in_use_again_is_abandoned_while_the_anomaly_lasts():
     bench = VerificationBench()
     bench.step(50)
@@ -576,6 +590,18 @@ def test_exploration_resumes_whichever_finding_of_the_muscle_stopped_the_arm_fir
     bench.end_anomaly([])
     bench.step(5)
     assert bench.core.supervisor.explores
+
+
+def test_another_method_during_a_verification_does_not_end_the_exploration():
+    bench = Bench()
+    bench.core.explore(True)
+    bench.step(20)
+    bench.verify(0)
+    bench.step(100)
+    bench.configure(method='second')
+    bench.end_anomaly([])
+    bench.step(5)
+    assert bench.core.supervisor.mode == 'exploring'
 
 
 @pytest.mark.parametrize('wish', ['hold', 'target'])

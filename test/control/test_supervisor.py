@@ -15,6 +15,7 @@ from musculoskeletal_ae.control.supervisor import (
     StopState,
     Supervisor,
 )
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 ANOMALY, OPERATOR = ConditionKind.ANOMALY.condition(), ConditionKind.OPERATOR.condition()
 STALE = ConditionKind.STALE_MUSCLE_STATES.condition()
@@ -60,20 +61,42 @@ def test_a_reset_is_refused_with_the_cause_that_is_present():
 def test_the_arm_explores_again_once_the_suspect_is_verified():
     supervisor = exploring()
     wait(supervisor, ANOMALY)
-    supervisor.on_suspect(True)
+    supervisor.on_anomaly(Anomaly.VERIFYING)
     assert supervisor.mode == 'verifying'
-    supervisor.on_verified()
-    wait(supervisor, ANOMALY, seconds=STEP)  # the anomaly has not ended yet
-    assert not supervisor.is_running
+    supervisor.on_anomaly(Anomaly.ENDED)
+    assert not supervisor.lacks_exploration
+    wait(supervisor)
+    assert supervisor.mode == 'exploring' and not supervisor.lacks_exploration
+
+
+def test_an_anomaly_that_is_still_present_after_the_verification_stops_the_arm_again():
+    supervisor = exploring()
+    wait(supervisor, ANOMALY)
+    supervisor.on_anomaly(Anomaly.VERIFYING)
+    supervisor.on_anomaly(Anomaly.ENDED)
+    wait(supervisor, ANOMALY, seconds=STEP)
+    wait(supervisor)
+    assert supervisor.mode == 'stopped' and supervisor.lacks_exploration
+
+
+@pytest.mark.parametrize('cause', stop_causes())
+def test_a_stop_by_an_event_lasts_until_a_reset_whatever_its_cause(cause):
+    supervisor = exploring()
+    supervisor.on_event(cause.condition())
+    wait(supervisor, seconds=10.0)
+    assert supervisor.mode == 'stopped' and supervisor.condition.kind is cause
+    assert supervisor.lacks_exploration
+    assert supervisor.on_reset([]) is None
+    assert supervisor.mode == 'idle' and supervisor.lacks_exploration
 
 
 @pytest.mark.parametrize('cause', [each for each in stop_causes() if each.clears is Clears.RESET])
 def test_a_verification_does_not_end_a_stop_that_needs_a_reset(cause):
     supervisor = exploring()
     wait(supervisor, ANOMALY)
-    supervisor.on_suspect(True)
+    supervisor.on_anomaly(Anomaly.VERIFYING)
     supervisor.on_event(cause.condition())
-    supervisor.on_verified()
+    supervisor.on_anomaly(Anomaly.ENDED)
     wait(supervisor, seconds=10.0)
     assert supervisor.mode == 'stopped'
 
@@ -81,9 +104,9 @@ def test_a_verification_does_not_end_a_stop_that_needs_a_reset(cause):
 def test_a_target_during_a_stop_is_held_after_it_and_exploration_does_not_come_back():
     supervisor = exploring()
     wait(supervisor, ANOMALY)
-    supervisor.on_suspect(True)
+    supervisor.on_anomaly(Anomaly.VERIFYING)
     supervisor.on_request(Activity.HOLDING)
-    supervisor.on_verified()
+    supervisor.on_anomaly(Anomaly.ENDED)
     wait(supervisor)
     assert supervisor.mode == 'holding'
 
@@ -97,13 +120,13 @@ class Arm(RuleBasedStateMachine):
         self.present = []
         self.before = StopState.RUNNING
         self.latched_by = set()  # causes since the stop began that do not end by themselves
-        self.may_start = True
+        self.may_start = self.may_explore = True
 
     @rule(activity=st.sampled_from(list(Activity)))
     def request(self, activity):
         self.before = self.supervisor.state
         self.supervisor.on_request(activity)
-        self.may_start = False
+        self.may_start, self.may_explore = False, True
 
     @rule(causes=st.lists(st.sampled_from(stop_causes()), max_size=3))
     def conditions(self, causes):
@@ -113,7 +136,7 @@ class Arm(RuleBasedStateMachine):
     def time_passes(self, released, steps):
         for _ in range(steps):
             self.before = self.supervisor.state
-            self.note(self.present)
+            self.note(c for c in self.present if c.kind.clears is not Clears.CONDITION)
             self.supervisor.on_conditions(self.present, STEP, released)
             self.may_start = not self.present and self.before in (
                 StopState.PAUSED,
@@ -134,29 +157,26 @@ class Arm(RuleBasedStateMachine):
         self.supervisor.on_offsets(known)
         self.may_start = False
 
-    @rule(isolated=st.booleans())
-    def suspect(self, isolated):
+    @rule(anomaly=st.sampled_from(list(Anomaly)))
+    def anomaly(self, anomaly):
         self.before = self.supervisor.state
-        self.supervisor.on_suspect(isolated)
-        self.may_start = False
-
-    @rule()
-    def verified(self):
-        self.before = self.supervisor.state
-        self.supervisor.on_verified()
+        self.supervisor.on_anomaly(anomaly)
         self.may_start = False
 
     @rule()
     def reset(self):
         self.before = self.supervisor.state
+        was_latched = self.supervisor.is_latched
         refused = self.supervisor.on_reset(self.present)
         assert (refused is None) == (not self.present)
         self.may_start = not self.present
+        if was_latched and refused is None:
+            self.may_explore = False
 
     def note(self, conditions):
         if self.supervisor.is_running:
             self.latched_by.clear()
-        self.latched_by |= {c.kind for c in conditions if c.kind.clears is not Clears.CONDITION}
+        self.latched_by |= {condition.kind for condition in conditions}
 
     @invariant()
     def check(self):
@@ -170,9 +190,8 @@ class Arm(RuleBasedStateMachine):
         # There is a cause exactly while the arm is stopped, and every cause has a remedy.
         assert (supervisor.condition is None) == supervisor.is_running
         assert supervisor.is_running or supervisor.condition.steps
-        # A latched stop ends exploration and motion, which then need a new request.
-        assert not (supervisor.is_latched and supervisor.activity is Activity.MOVING)
-        assert not (supervisor.is_latched and supervisor.explores)
+        # After the reset of a latched stop, an exploration needs a new request.
+        assert self.may_explore or not supervisor.explores
 
 
 TestArm = Arm.TestCase
