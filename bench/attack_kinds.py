@@ -134,11 +134,11 @@ class Scene:
 
     def _goes_on(self, moment: str) -> bool:
         mode = self.attack.modes[-1][1] if self.attack.modes else ''
-        if moment == 'exploring' and mode in ('idle', 'holding', 'torque'):
+        if moment == 'exploring' and mode in ('idle', 'holding'):
             request = SetBool.Request(data=True)
             self.attack.call(SetBool, 'controller/explore', request)
             return False
-        return mode in ('idle', 'holding', 'moving', 'torque', 'exploring')
+        return mode in ('idle', 'holding', 'moving', 'exploring')
 
     def follow_advice(self) -> None:
         """Follow the advice of all reports on /diagnostics, and restart silent nodes."""

@@ -107,12 +107,15 @@ class Activities:
 
     def of(self, activity: Activity) -> ActivityControl | None:
         """Return the object that implements an activity; None for `IDLE`."""
-        if activity in (Activity.HOLDING, Activity.MOVING):
-            return self.follower if self._setup.settings.is_by_follower else self.ramped_target
+        settings = self._setup.settings
+        if activity is Activity.HOLDING:
+            if settings.control_method.commands_tension:
+                return self.torque
+            return self.follower if settings.is_by_follower else self.ramped_target
         others: dict[Activity, ActivityControl] = {
+            Activity.MOVING: self.follower,
             Activity.EXPLORING: self.exploring,
             Activity.CALIBRATING: self.calibrating,
-            Activity.TORQUE: self.torque,
             Activity.GRAVITY_COMPENSATION: self.gravity_compensation,
         }
         return others.get(activity)
@@ -543,7 +546,7 @@ class Controller:
         """
         activity, target = self.supervisor.activity, self.target_state
         control = self.activities.of(activity)
-        is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running
+        is_holding = activity is Activity.HOLDING and self.supervisor.is_running
         has_arrived = is_holding and control is not None and control.has_arrived
         return target.theta if has_arrived and not target.effort.any() else None
 
@@ -679,9 +682,7 @@ class Controller:
         """Move to the target with the present method, starting from the present tensions."""
         has_target = self.target_state.theta is not None
         self.activities.leave()
-        self.supervisor.on_request(
-            self.settings.control_method.activity if has_target else Activity.IDLE
-        )
+        self.supervisor.on_request(Activity.HOLDING if has_target else Activity.IDLE)
 
     def _approach(self, duration: float) -> None:
         """Start a trajectory of `duration` [s] to the target, along `Planner.to_posture`'s path."""
@@ -713,11 +714,9 @@ class Controller:
 
     @property
     def is_following(self) -> bool:
-        """Whether the follower commands the arm, to move to a target or to hold it."""
-        activity = self.supervisor.activity
+        """Whether the follower has issued the last command, to move to a target or to hold it."""
         follower = self.activities.follower
-        is_used = self.activities.of(activity) is follower
-        return is_used and follower.progress.trajectory is not None
+        return self.activities.entered is follower and follower.progress.trajectory is not None
 
     @property
     def _is_ready(self) -> bool:

@@ -35,7 +35,6 @@ DOING = {
     Activity.MOVING: 'following a trajectory',
     Activity.EXPLORING: 'exploring',
     Activity.CALIBRATING: 'exploring gently',
-    Activity.TORQUE: 'holding',
     Activity.GRAVITY_COMPENSATION: 'gravity compensation',
 }
 _OF_READINGS = ConditionKind.IMPLAUSIBLE_ESTIMATE, ConditionKind.STALE_ESTIMATE

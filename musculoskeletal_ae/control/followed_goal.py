@@ -8,6 +8,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.joint_units import JointUnits
 
@@ -52,29 +53,43 @@ class FollowedGoal:
             patience: Longest time after the end of the trajectory until the tolerances `goal` are
                 met [s]; 0 for no limit.
         """
-        self._core, self._trajectory = core, core.activities.follower.progress.latest
+        trajectory = core.activities.follower.progress.latest
+        assert trajectory is not None
+        self._core, self._trajectory = core, trajectory
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
+        self._ended_at: float | None = None  # time at which the trajectory had ended [s]
 
-    def outcome(self) -> tuple[int, str] | None:
-        """Return an error code (0 for success) and its reason, or None while the goal is active."""
+    def outcome(self, time: float) -> tuple[int, str] | None:
+        """Return an error code (0 for success) and its reason, or None while the goal is active.
+
+        Args:
+            time: Time of the messages' clock [s].
+        """
         core, trajectory = self._core, self._trajectory
         progress, condition = core.activities.follower.progress, core.supervisor.condition
         if condition is not None:
             return INVALID, f'stopped: {condition.text}'
-        if not core.is_following or trajectory is None:
-            return (
-                INVALID,
-                f'the trajectory ended, because the mode changed to {core.supervisor.mode}',
-            )
-        if progress.latest is not trajectory:
+        holds, target = core.supervisor.activity is Activity.HOLDING, core.target_state.theta
+        is_target = target is not None and np.array_equal(target, trajectory.end)
+        if progress.latest is trajectory:
+            if progress.trajectory is not trajectory:
+                return None  # the trajectory has not started yet
+            off = np.abs(progress.error)
+            if progress.time < trajectory.duration:
+                return self._beyond(BEYOND_PATH, off, self._path)
+        elif progress.latest is not None or (holds and not is_target):
             return INVALID, 'the trajectory was replaced by another target'
-        if progress.trajectory is not trajectory:
-            return None  # the trajectory has not started yet
-        off = np.abs(progress.error)
-        if progress.time < trajectory.duration:
-            return self._beyond(BEYOND_PATH, off, self._path)
+        elif not holds or self._ended_at is None:
+            mode = core.supervisor.mode
+            return INVALID, f'the trajectory ended, because the mode changed to {mode}'
+        elif core.estimate is None:
+            return None
+        else:  # a method such as `tension` holds the end without the follower
+            off = np.abs(trajectory.end - core.estimate)
+        if self._ended_at is None:
+            self._ended_at = time
         if missed := self._beyond(BEYOND_GOAL, off, self._goal):
-            return missed if 0.0 < self._patience < progress.over else None
+            return missed if 0.0 < self._patience < time - self._ended_at else None
         return SUCCESSFUL, ''
 
     def _beyond(self, code: int, off: Array, bounds: Array) -> tuple[int, str] | None:

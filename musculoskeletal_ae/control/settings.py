@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.parameters import PRESET, naming_parameter, parameters_of, settable
@@ -31,24 +30,16 @@ class ControlMethod:
     """How a control method differs from others, apart from how it computes commands.
 
     Attributes:
-        activity: What the arm does at its target.
+        commands_tension: Whether the method commands tensions; all others command lengths.
+        is_guided: Whether a hand guides the arm, so that it follows no target.
         uses_effort: Whether the arm exerts the effort of a target.
         sets_stiffness: Whether tensions are chosen for the setting `joint_stiffness`.
     """
 
-    activity: Activity = Activity.HOLDING
+    commands_tension: bool = False
+    is_guided: bool = False
     uses_effort: bool = True
     sets_stiffness: bool = False
-
-    @property
-    def commands_tension(self) -> bool:
-        """Whether the method commands tensions; all others command lengths."""
-        return self.activity in (Activity.TORQUE, Activity.GRAVITY_COMPENSATION)
-
-    @property
-    def is_guided(self) -> bool:
-        """Whether a hand guides the arm, so that it follows no target."""
-        return self.activity is Activity.GRAVITY_COMPENSATION
 
 
 #: all control methods, by the value of the setting `method`
@@ -57,9 +48,9 @@ METHODS = {
     'first': ControlMethod(uses_effort=False),
     'second': ControlMethod(uses_effort=False),
     'proposed': ControlMethod(),
-    'tension': ControlMethod(activity=Activity.TORQUE),
+    'tension': ControlMethod(commands_tension=True),
     'stiffness': ControlMethod(sets_stiffness=True),
-    'float': ControlMethod(activity=Activity.GRAVITY_COMPENSATION),
+    'float': ControlMethod(commands_tension=True, is_guided=True),
 }
 BY_LENGTH = tuple(name for name, method in METHODS.items() if not method.commands_tension)
 
@@ -214,9 +205,10 @@ class Settings:
 
     @property
     def is_by_follower(self) -> bool:
-        """Whether the `Follower` moves the arm to targets with the control method.
+        """Whether the `Follower` moves the arm to targets and holds them.
 
         All other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
+        With these methods, the `Follower` only follows trajectories, hand poses and twists.
         """
         return self.method in BY_LENGTH and self.method not in self.length_methods
 

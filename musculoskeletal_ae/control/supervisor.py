@@ -24,11 +24,10 @@ class Activity(Enum):
     """What the arm does when nothing stops it."""
 
     IDLE = 'idle'  # the arm has no target yet
-    HOLDING = 'holding'
+    HOLDING = 'holding'  # the control method moves the arm to its target and holds it there
     MOVING = 'moving'  # the arm follows a trajectory
     EXPLORING = 'exploring'
     CALIBRATING = 'calibrating'  # exploring gently while the length offsets are unknown
-    TORQUE = 'torque'  # the arm is controlled by commanded tensions (method `tension`)
     #: the arm is guided by hand, and only its weight is compensated (method `float`)
     GRAVITY_COMPENSATION = 'gravity_compensation'
 

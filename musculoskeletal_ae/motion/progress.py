@@ -23,7 +23,6 @@ class Progress:
         next: The trajectory that will replace the present one, and the time until then [s]; None if
             no other trajectory is due.
         time: Time since the start of the trajectory [s].
-        over: Time since the end of the trajectory [s]; 0 before its end.
         desired: The present setpoint.
         error: Posture error, desired − estimated θ [rad], (D,).
     """
@@ -32,14 +31,13 @@ class Progress:
         self._setup, joints = setup, setup.robot.joint_count
         self.trajectory: Trajectory | None = None
         self.next: tuple[Trajectory, float] | None = None
-        self.time = self.over = 0.0
+        self.time = 0.0
         self.desired = Setpoint.resting(np.zeros(joints))
         self.error: Array = np.zeros(joints)
 
     def begin(self, trajectory: Trajectory, time: float = 0.0) -> None:
         """Replace all trajectories by a trajectory that began `time` [s] ago."""
         self.trajectory, self.time, self.next = trajectory, time, None
-        self.over = 0.0
 
     def discard(self) -> None:
         """Discard all trajectories, so that the next motion has to be planned anew."""
@@ -58,7 +56,6 @@ class Progress:
         """Advance by dt [s], and return whether the next trajectory has begun."""
         assert self.trajectory is not None
         self.time += dt
-        self.over += dt if self.time >= self.trajectory.duration else 0.0
         if self.next is None:
             return False
         trajectory, delay = self.next[0], self.next[1] - dt

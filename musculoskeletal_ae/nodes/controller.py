@@ -309,7 +309,7 @@ class ControllerNode(Shell):
         if self.core.is_following:
             self.states.publish(self._state())
         if self.action is not None:
-            self.action.step(self._state)
+            self.action.step(self._state, self.now())
         if command is not None:
             self._remember_stop()
         self._record_stop()

@@ -94,23 +94,25 @@ class FollowJointTrajectory:
         with suppress(MessageError):  # raised if the controller has already stopped
             self._core.trajectory(None)
 
-    def step(self, get_state: Callable[[], Any]) -> None:
+    def step(self, get_state: Callable[[], Any], time: float) -> None:
         """Publish feedback on the active goal, and end the goal when it has an outcome.
 
         Args:
             get_state: Returns the controller's state as a message of `controller_state`.
+            time: Time of the ROS clock [s].
         """
         if self._handle is None or self._goal is None:
             return
         if self._handle.is_cancel_requested:
             self._end(SUCCESSFUL, 'cancelled: the arm comes to rest')
             return
-        state = get_state()
-        desired, actual, error = state.points
-        names = {'header': state.header, 'joint_names': state.joint_names}
-        feedback = self._kind.Feedback(**names, desired=desired, actual=actual, error=error)
-        self._handle.publish_feedback(feedback)
-        if outcome := self._goal.outcome():
+        if self._core.is_following:
+            state = get_state()
+            desired, actual, error = state.points
+            names = {'header': state.header, 'joint_names': state.joint_names}
+            feedback = self._kind.Feedback(**names, desired=desired, actual=actual, error=error)
+            self._handle.publish_feedback(feedback)
+        if outcome := self._goal.outcome(time):
             if outcome[0] not in (SUCCESSFUL, INVALID):
                 self._rest()
             self._end(*outcome)

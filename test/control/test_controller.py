@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole controller without an arm: the test provides sensor data and time."""
 
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -210,6 +210,32 @@ def test_after_reset_the_last_target_is_resumed_by_a_ramp(monkeypatch):
     bench.step(150)
     assert bench.core.reset(bench.now) is None
     np.testing.assert_allclose(bench.step(200)[-1].value, goal, atol=1e-9)
+
+
+@pytest.mark.parametrize('method', sorted(set(METHODS) - {'float'}))
+def test_every_method_follows_a_trajectory_once_and_then_holds_its_end(method):
+    bench = settled(method=method, first_duration=0.5, second_duration=0.5)
+    way = TrajectoryPoints(np.arange(2), np.array([0.5, 1.0]), np.array([REST, OTHER]), None, None)
+    bench.core.trajectory(way)
+    followed, sent = bench.follower.progress.latest, []
+    while bench.core.supervisor.mode != 'holding':
+        sent += bench.step()
+        bench.theta = bench.follower.progress.desired.theta.copy()
+    assert {command.kind for command in sent} == {LENGTH}
+    assert len(sent) == pytest.approx(followed.duration / DT, abs=2)
+    np.testing.assert_allclose(bench.theta, OTHER)
+    sent += bench.step(200)
+    is_by_tension = METHODS[method].commands_tension
+    assert sent[-1].kind == (TENSION if is_by_tension else LENGTH)
+    assert bench.report().message == 'holding'
+    bench.configure(method='stiffness' if method == 'proposed' else 'proposed')
+    sent += bench.step(50)
+    assert bench.follower.progress.latest is not followed
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
+    for former, later in pairwise(sent):
+        if former.kind == later.kind:
+            rate = bench.core.settings.rate_limit * (1.0 if later.kind == LENGTH else 1e4)
+            assert np.abs(later.value - former.value).max() <= rate * DT + 1e-9
 
 
 @pytest.mark.parametrize('steps', [0, 1, 30])  # before and during the trajectory

@@ -16,6 +16,7 @@ from musculoskeletal_ae.control.followed_goal import (
     FollowedGoal,
     read_tolerances,
 )
+from musculoskeletal_ae.control.settings import METHODS
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 
@@ -26,8 +27,8 @@ TIGHT = np.array([0.05, np.inf])
 class FollowingBench:
     """A controller that follows a trajectory of 1 s, and the goal that requested the trajectory."""
 
-    def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0):
-        self.bench = Bench()
+    def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0, method='proposed'):
+        self.bench = Bench(method=method)
         self.bench.target(REST)
         self.bench.step(5)
         self.start(delay)
@@ -45,7 +46,7 @@ class FollowingBench:
             The result (None if there was none) and the number of steps.
         """
         for step in range(steps):
-            if outcome := self.goal.outcome():
+            if outcome := self.goal.outcome(self.bench.now):
                 return outcome, step
             self.bench.step()
             if moves and self.bench.core.is_following:
@@ -98,6 +99,21 @@ def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
     assert steps < 100.0 * (bench.follower.progress.trajectory.duration + 1.5)
 
 
+@pytest.mark.parametrize('method', sorted(set(METHODS) - {'float'}))
+def test_a_goal_is_followed_and_its_end_is_awaited_with_every_method(method):
+    followed = FollowingBench(path=TIGHT, goal=TIGHT, method=method)
+    (code, reported), steps = followed.run()
+    assert (code, reported) == (SUCCESSFUL, '') and steps >= 98
+    followed = FollowingBench(goal=TIGHT, patience=0.5, method=method)
+    (code, reported), steps = followed.run(moves=False)
+    assert code == BEYOND_GOAL and ROBOT.joints[0] in reported
+    assert steps >= 148
+    followed = FollowingBench(goal=TIGHT, method=method)
+    assert followed.run(150, moves=False)[0] is None
+    followed.bench.target(REST)
+    assert followed.run()[0] == (INVALID, 'the trajectory was replaced by another target')
+
+
 @pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])
 def test_what_ends_the_trajectory_ends_the_goal(event):
     followed = FollowingBench()
@@ -117,7 +133,7 @@ def test_what_ends_the_trajectory_ends_the_goal(event):
         'trajectory': 'replaced',
         'target': 'replaced',
         'stop': 'stopped: controller/stop',
-        'method': 'the mode changed to torque',
+        'method': 'the mode changed to holding',
     }
     assert reasons[event] in reported
 
