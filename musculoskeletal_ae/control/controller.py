@@ -203,7 +203,8 @@ class Controller:
         """Configure all parts with new settings.
 
         If the method or the preset changes while the arm has a target, the arm moves to this
-        target anew, starting from the present tensions.
+        target anew, starting from the present tensions. After method `float`, the arm stays where
+        the hand has led it.
 
         Raises:
             ParameterError: If the joint stiffness or the method does not fit the robot.
@@ -213,8 +214,17 @@ class Controller:
         is_stiffer = settings.desired_stiffness(units) != before.desired_stiffness(units)
         self.setup.settings = settings
         is_other = (settings.method, settings.preset) != (before.method, before.preset)
+        nothing = np.zeros(self.robot.joint_count)
         if settings.control_method.is_guided:
+            self.target_state = Target(nothing)
             self._request(Activity.GRAVITY_COMPENSATION)
+        elif before.control_method.is_guided:
+            # While length offsets are unknown, the estimated posture may be wrong.
+            here = self.estimate if self.stream.body.offsets.known else None
+            if here is not None:
+                here = np.clip(here, self.robot.lower, self.robot.upper)
+            self.target_state = Target(nothing, here)
+            self._hold()
         elif is_other and not self.supervisor.explores:
             self._hold()
         if settings.control_method.sets_stiffness and is_stiffer.any():
@@ -604,17 +614,16 @@ class Controller:
         self.stop(ConditionKind.CONTROL_FAULT, f'{type(error).__name__}: {error}')
 
     def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        """Return the command of an activity, and act on the properties of the activity.
+        """Return the command of an activity; tell the supervisor when its motion has ended.
 
-        Depending on these properties, a trajectory starts, the target is replaced, or the
-        supervisor learns that the motion has ended.
+        If the follower has no trajectory, because a stop or another activity has discarded it, the
+        arm first approaches the target.
         """
-        if control.needs_trajectory and self.target_state.theta is not None:
+        follower = self.activities.follower
+        is_discarded = control is follower and follower.progress.trajectory is None
+        if is_discarded and self.target_state.theta is not None:
             self._approach(self.settings.first_duration)
         command = self.activities.step(control, inputs)
-        if (theta := control.new_target) is not None:
-            inside = np.clip(theta, self.robot.lower, self.robot.upper)
-            self.target_state = Target(np.zeros_like(inside), inside)
         if control.has_arrived:
             self.supervisor.on_arrival()
         return command

@@ -67,11 +67,6 @@ class ActivityControl(ABC):
         """Leave the activity, because another activity or a stop follows."""
 
     @property
-    def needs_trajectory(self) -> bool:
-        """Whether the activity needs a new trajectory from the present posture to the target."""
-        return False
-
-    @property
     def has_arrived(self) -> bool:
         """Whether the requested motion has ended. If so, the arm should rest at its target."""
         return False
@@ -79,11 +74,6 @@ class ActivityControl(ABC):
     @property
     def missing_torque(self) -> Array | None:
         """Torque [N·m], (D,), that the muscles cannot exert at the target; None if unknown."""
-        return None
-
-    @property
-    def new_target(self) -> Array | None:
-        """Posture [rad], (D,), that replaces the target; None if the target does not change."""
         return None
 
 

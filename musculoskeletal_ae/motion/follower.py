@@ -110,11 +110,6 @@ class Follower(ActivityControl):
             self.plan_anew()
 
     @property
-    def needs_trajectory(self) -> bool:
-        """Whether there is no trajectory, because a stop has discarded it."""
-        return self.progress.trajectory is None
-
-    @property
     def has_arrived(self) -> bool:
         """Whether the last trajectory has ended. If so, the arm should rest at its end."""
         return not self.progress.is_moving

@@ -119,7 +119,6 @@ class GravityCompensation(TorqueControl):
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
         self.held: Array | None = None  # θ_held, at which the spring holds the arm [rad], (D,)
-        self._theta: Array | None = None  # the last posture [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
         """Enter the activity in the present posture, starting from the present tensions."""
@@ -128,13 +127,7 @@ class GravityCompensation(TorqueControl):
 
     def step(self, inputs: Inputs) -> Command | None:
         """Advance by one control step and return the tension command."""
-        self._theta = inputs.theta
         return self._command_towards(inputs.theta, np.zeros_like(inputs.theta), inputs)
-
-    @property
-    def new_target(self) -> Array | None:
-        """Present posture [rad], (D,): the target that another method holds after this one."""
-        return self._theta
 
     def _stops(self, theta: Array, target: Array, effort: Array) -> None:
         """Return no stops: the muscles carry the arm, so that a hand can lead it off a stop."""

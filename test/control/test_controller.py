@@ -21,6 +21,7 @@ from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.motion.feedback import REPLAN
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 EVENTS = {
     'target': lambda bench: bench.target(OTHER),
@@ -509,7 +510,22 @@ def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_th
         bench.step()
     bench.configure(method='proposed')
     assert {command.kind for command in bench.step(100)} == {LENGTH}
-    np.testing.assert_allclose(bench.core.target_state.theta, OTHER, atol=0.06)
+    np.testing.assert_allclose(bench.core.target_state.theta, OTHER)
+    assert bench.report().message == 'holding'
+
+
+def test_a_posture_from_unknown_lengths_does_not_become_a_target_after_gravity_compensation():
+    bench = Bench(method='float')
+    bench.step(20)
+    unknown = LengthOffsets.unknown(ROBOT.muscle_count)
+    bench.core.use_body(bench.core.stream.body.with_offsets(unknown))
+    bench.step(20)
+    bench.configure(method='proposed')
+    bench.core.use_body(
+        bench.core.stream.body.with_offsets(LengthOffsets.none(len(unknown.offset)))
+    )
+    bench.step(20)
+    assert bench.core.target_state.theta is None and bench.report().message == 'no target'
 
 
 def test_a_stop_ends_gravity_compensation_and_a_reset_resumes_it():
