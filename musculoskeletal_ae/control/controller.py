@@ -496,14 +496,15 @@ class Controller:
             present.append(ConditionKind.ANOMALY.condition())
         if detail := self.stream.implausible(now):
             present.append(ConditionKind.IMPLAUSIBLE_MUSCLE_STATES.condition(detail))
-        if detail := self._revoked_lengths():
+        if detail := self._revoked_lengths:
             present.append(ConditionKind.LENGTH_OFFSETS_REVOKED.condition(detail))
         if detail := self._estimate_problem.lasting(now):
             present.append(ConditionKind.IMPLAUSIBLE_ESTIMATE.condition(detail))
         return sorted(present, key=lambda condition: ORDER[condition.identifier])
 
+    @property
     def _revoked_lengths(self) -> str:
-        """Return which length offsets the estimator has revoked, or ''."""
+        """Whose length offsets the estimator has revoked, as a text; '' if it has revoked none."""
         muscles = self.stream.body.offsets.revoked
         if not muscles:
             return ''

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from readings import reading
 
 from musculoskeletal_ae.awake_clock import PAUSE
-from musculoskeletal_ae.control.controller import REACTION_TIME, WINDOW
+from musculoskeletal_ae.control.controller import WINDOW
 from musculoskeletal_ae.control.supervisor import RESUME
 from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, Overload
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.signals.body_state import Trust
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_states import QUANTITIES
 
@@ -341,16 +342,20 @@ def causes(bench):
 def test_during_an_anomaly_the_estimator_decides_whether_a_jump_is_due_to_a_repair(is_confirmed):
     bench = distorting()
     bench.find()
-    bench.lies(round((LIMITS.settled + REACTION_TIME + 0.5) / DT), length=with_a_jump)
+    bench.lies(round((LIMITS.settled + 0.5) / DT), length=with_a_jump)
     bench.lie = lambda read: np.array([with_a_jump(read[0]), *read[1:]])
     assert causes(bench) == ['anomaly_detected']
-    if is_confirmed:
-        body = bench.core.stream.body
-        confirmed = replace(body.offsets, deviation=body.offsets.deviation + 0.01)
-        bench.core.use_body(body.with_offsets(confirmed))
+    body = bench.core.stream.body
+    decided = (
+        replace(body.offsets, deviation=body.offsets.deviation + 0.01)
+        if is_confirmed
+        else replace(body.offsets, trust=np.full(ROBOT.muscle_count, Trust.REVOKED))
+    )
+    bench.core.use_body(body.with_offsets(decided))
     bench.end_anomaly()
     bench.step(50)
     assert causes(bench) == ([] if is_confirmed else ['length_offsets_revoked'])
+    assert (bench.core.reset(bench.now) is None) == is_confirmed
 
 
 def with_a_jump(length):
