@@ -19,7 +19,7 @@ from rclpy.node import Node as RosNode
 
 from musculoskeletal_ae import conditions
 from musculoskeletal_ae.conditions import CONDITIONS, KINDS, LEVELS, Condition, ConditionKind, Level
-from musculoskeletal_ae.control.supervisor import Activity, StopState
+from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.report import with_load
 from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE, values_of
@@ -246,11 +246,6 @@ class Situation:
         """Activity of the controller, or why the arm stands still; '' without a controller."""
         controller = self._reports.get('controller')
         return '' if controller is None else controller.message
-
-    @property
-    def is_stopped(self) -> bool:
-        """Whether the controller reports that it is stopped."""
-        return self.values('controller').get('mode') == StopState.STOPPED.value
 
     @property
     def has_reported(self) -> bool:

@@ -63,9 +63,6 @@ TEXT_PERIOD = 0.25  # update texts and curves at this interval [s]
 GRAPH_PERIOD = 1.0  # look for running nodes and other arms at this interval [s]
 PATIENCE = 10.0  # wait at most this long for the response of a service [s]
 STOP_CHECK_PERIOD = 0.1  # check for a stop signal after at most this time [s]
-#: show the outcome of a reset after this time [s]; by then, a cause that is still present has
-#: stopped the arm again
-SETTLE_TIME = 2.5
 #: topics from which the arms on the page are drawn
 ARM_TOPICS = {
     'measured': 'joint_states',
@@ -125,7 +122,6 @@ class View(Node):
         self.texts_at = self.graph_at = self.reported_at = -math.inf
         self.faults: list[str] = []  # faults that the hardware emulator imitates
         self.payload = 0.0
-        self.reset_at = math.inf  # time of a reset whose outcome has not been shown yet [s]
         #: service requests without a response: time sent [s], future, callback
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []
         self.answers = SingleThreadedExecutor()
@@ -290,15 +286,7 @@ class View(Node):
         values = error, anomaly, distance, situation.number('estimator', 'd limit')
         now, is_urgent = time.monotonic(), situation.level() == 'error'
         self.page.tell([*filter(None, lines)], trouble, muscles, now, values, is_urgent)
-        self._show_reset_outcome()
         self.page.follow(self.payload, self._newest('played', math.inf))
-
-    def _show_reset_outcome(self) -> None:
-        """Show visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
-        if time.monotonic() > self.reset_at + SETTLE_TIME:
-            self.reset_at = math.inf
-            trouble, is_stopped = self.situation.trouble(), self.situation.is_stopped
-            self.page.notify(f'stopped again: {trouble}' if is_stopped else 'reset', not is_stopped)
 
     def _reset(self) -> None:
         """Reset anomaly and stop, unless a ruptured muscle of the emulated arm is not isolated."""
@@ -310,20 +298,14 @@ class View(Node):
 
         def go_on(answer: Any) -> None:
             if answer.success:
-                self._ask('controller/reset', then=note_reset, quiet=True)
+                self._ask('controller/reset')
             else:
                 self.page.notify(printable(f'estimator/reset: {answer.message}'), False)
-
-        def note_reset(answer: Any) -> None:
-            if answer.success:
-                self.reset_at = time.monotonic()
-            else:
-                self.page.notify(printable(f'controller/reset: {answer.message}'), False)
 
         if self.clients_of['estimator/reset'].service_is_ready():
             self._ask('estimator/reset', then=go_on, quiet=True)
         else:
-            self._ask('controller/reset', then=note_reset, quiet=True)
+            self._ask('controller/reset')
 
     def _look(self) -> None:
         """Show all arms and the controls for running nodes, and request the emulator's state."""
