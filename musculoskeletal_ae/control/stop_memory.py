@@ -4,11 +4,12 @@
     controller.stop    the stop with which the next controller begins
     controller.lock    locked by the controller that uses the directory
 
-While a controller commands the arm, controller.stop names the stop cause `restarted`. A latched
-stop replaces this cause by its own. A controller that ends properly while no stop is latched
-deletes controller.stop. The file therefore remains if a stop was latched, or if the controller was
-killed or has crashed. A controller that finds controller.stop when it starts is stopped from the
-beginning, and moves the arm only after `controller/reset`.
+While a controller commands the arm, controller.stop contains the word `running`. A latched stop
+replaces this word by its cause. A controller that ends properly while no stop is latched deletes
+controller.stop. The file therefore remains if a stop was latched, or if the controller was killed
+or has crashed. A controller that finds controller.stop when it starts is stopped from the
+beginning, and moves the arm only after `controller/reset`. If the file names no cause, the cause is
+`restarted`.
 """
 
 from pathlib import Path
@@ -19,6 +20,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import locked
 from musculoskeletal_ae.remembered_text import RememberedText
 
+RUNNING = 'running'  # the word in the file while a controller commands the arm
 FILE, LOCK = 'controller.stop', 'controller.lock'
 BEFORE = 'before this controller was started'
 LOST = 'the stop cannot be saved, so a restarted controller will not know it'
@@ -42,8 +44,8 @@ class StopMemory:
             MusculoskeletalError: If the directory cannot be used, or another controller uses it.
         """
         self.found: Condition | None = None
-        self._written: ConditionKind | None = None  # the stop cause that the file contains
-        self._is_latched = False  # whether the file has to outlive this controller
+        #: the word that the file certainly contains, RUNNING or a stop cause; None if there is none
+        self._written: str | None = None
         self._file: RememberedText | None = None
         self._lock: TextIO | None = None
         if directory is None:
@@ -72,8 +74,8 @@ class StopMemory:
             raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error
         self._file = remembered
         if text is not None:
-            self._is_latched, self._written = True, _cause_in(text)
-            self.found = self._written.condition(BEFORE)
+            cause = _cause_in(text)
+            self.found, self._written = cause.condition(BEFORE), cause.identifier
 
     def note(self, stop: Condition | None) -> None:
         """Write the present latched stop to the file.
@@ -81,16 +83,16 @@ class StopMemory:
         If writing fails, `problem` states the reason, and a later call tries again.
 
         Args:
-            stop: The latched stop, or None. Without one, the file has the cause `restarted`, with
-                which the controller stops if it restarts after a crash.
+            stop: The latched stop, or None if the controller commands the arm.
         """
-        self._is_latched = stop is not None
-        cause = ConditionKind.RESTARTED if stop is None else stop.kind
-        if self._file is None or cause is self._written:
+        word, text = RUNNING, 'a controller commands the arm'
+        if stop is not None:
+            word, text = stop.kind.identifier, stop.text
+        if self._file is None or word == self._written:
             return
-        text = cause.text if stop is None else stop.text
-        if self._file.write(f'{cause.identifier}\n{text}\n'):
-            self._written = cause
+        self._written = None
+        if self._file.write(f'{word}\n{text}\n'):
+            self._written = word
 
     @property
     def problem(self) -> str:
@@ -98,8 +100,8 @@ class StopMemory:
         return '' if self._file is None else self._file.problem
 
     def close(self) -> None:
-        """Delete the file unless a stop is latched, and release the directory."""
-        if self._file is not None and not self._is_latched:
+        """Delete the file unless it may contain a stop, and release the directory."""
+        if self._file is not None and self._written == RUNNING:
             self._file.delete()
         if self._lock is not None:
             self._lock.close()
@@ -108,7 +110,7 @@ class StopMemory:
 
 
 def _cause_in(text: str) -> ConditionKind:
-    """Return the stop cause in the text of a file; `restarted` if the text states none."""
+    """Return the stop cause in the text of a file; `restarted` if the text names none."""
     for cause in stop_causes():
         if text.partition('\n')[0] == cause.identifier:
             return cause

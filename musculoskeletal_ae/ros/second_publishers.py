@@ -11,9 +11,8 @@ graph for up to 20 s beside its successor, but sends no more messages. Any of th
 that a second node runs:
 
 - Sequence numbers that decrease repeatedly, because messages of two nodes alternate.
-- A report on /diagnostics under our own name with another identity, after our first report. The
-  identity is a random number of the reporting node. A node reads reports only while the graph has
-  two nodes of its name.
+- A report on /diagnostics under our own name with another identity, which is a random number of
+  the reporting node. A node reads reports only while the graph has two nodes of its name.
 - Two publishers that have both been in the graph for longer than the graph keeps a killed one.
 """
 
@@ -146,19 +145,11 @@ class Twins:
         # Include CDR's length prefix, so that `/controller` does not match in `/left/controller`.
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
-        self._has_reported = False
         self._others = Arrival(clock)  # reports that other nodes of this name have sent
 
     def take(self, report: bytes, now: float) -> None:
-        """Process a serialized report (CDR) that arrived at `now` [s].
-
-        A report before our own first one is ignored, because a killed predecessor may have sent it.
-        """
-        if self._name not in report:
-            return
-        if self._identity in report:
-            self._has_reported = True
-        elif self._has_reported:
+        """Process a serialized report (CDR) that arrived at `now` [s]."""
+        if self._name in report and self._identity not in report:
             self._others.use(now)
 
     def is_alone(self, now: float) -> bool:

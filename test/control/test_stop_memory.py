@@ -51,6 +51,14 @@ def test_a_killed_controller_counts_as_a_stop_and_a_proper_end_does_not(tmp_path
     assert found(arm) is None
 
 
+def test_a_killed_controller_counts_as_a_stop_also_after_the_next_one_has_ended(tmp_path):
+    arm = tmp_path / 'arm'
+    StopMemory(arm).note(None)
+    copy = killed(arm)
+    assert found(copy) is ConditionKind.RESTARTED
+    assert found(copy) is ConditionKind.RESTARTED
+
+
 def test_a_reset_ends_a_stop_for_the_next_controller_too(tmp_path):
     arm = tmp_path / 'arm'
     first = StopMemory(arm)

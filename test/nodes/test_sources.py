@@ -71,7 +71,6 @@ def report(node, identity):
 
 def test_a_second_node_of_the_same_name_is_noticed_by_its_reports():
     twins = Twins('/controller: state', 'ours')
-    twins.take(report('/controller', 'of one that was killed'), 0.0)
     twins.take(report('/controller', 'ours'), 0.1)
     twins.take(report('/left/controller', 'of another arm'), 0.2)
     assert twins.is_alone(0.2)
