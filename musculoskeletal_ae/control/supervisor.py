@@ -194,7 +194,7 @@ class Supervisor:
     # -- stops ----------------------------------------------------------------------------------
 
     def on_event(self, condition: Condition) -> None:
-        """Stop until a reset because of an event, such as a call of controller/stop."""
+        """Latch a stop because of an event, such as a call of controller/stop."""
         self._latch([condition])
 
     def on_conditions(self, present: Sequence[Condition], elapsed: float, released: bool) -> None:
