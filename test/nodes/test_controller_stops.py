@@ -71,7 +71,7 @@ def test_a_stop_pays_out_is_reported_and_recorded_and_ends_only_by_a_reset(
     assert files[0].read_text() == 'controller/stop was called\n'
     bag = Bag.open(files[0].parent)
     sent = [m for m in bag.messages() if m.topic.endswith('/muscle_length_command')]
-    assert len(sent) > 30
+    assert sent
     heard = {name.rpartition('/')[2] for name in bag.topics}
     assert {'muscle_states', 'estimated_joint_states', 'target_joint_states'} <= heard
 
