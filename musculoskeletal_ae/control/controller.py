@@ -322,13 +322,13 @@ class Controller:
         is_known = body.offsets.known
         if is_known != before.known or (body.offsets.offset != before.offset).any():
             self.activities.leave()
+            self.supervisor.on_offsets(is_known)
         if not is_known and not body.offsets.revoked:
             # A length calibration begins or continues. The estimate is discarded, because it was
             # computed with other offsets.
             self.watchdog.estimate.expect_later(self.watchdog.steps.stepped_at, FIRST_ESTIMATE)
             self.estimate = None
         self.limiter.offsets_known = is_known
-        self.supervisor.on_offsets(is_known)
 
     def clock_jumped_back(self) -> None:
         """Adapt to a backward jump of the messages' clock.

@@ -86,8 +86,8 @@ class FollowedGoal:
             return None
         else:  # a method such as `tension` holds the end without the follower
             off = np.abs(trajectory.end - core.estimate)
-        if self._ended_at is None:
-            self._ended_at = time
+        # The clock may have jumped back.
+        self._ended_at = time if self._ended_at is None else min(self._ended_at, time)
         if missed := self._beyond(BEYOND_GOAL, off, self._goal):
             return missed if 0.0 < self._patience < time - self._ended_at else None
         return SUCCESSFUL, ''

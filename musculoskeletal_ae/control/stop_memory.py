@@ -23,7 +23,7 @@ from musculoskeletal_ae.remembered_text import RememberedText
 RUNNING = 'running'  # the word in the file while a controller commands the arm
 FILE, LOCK = 'controller.stop', 'controller.lock'
 BEFORE = 'before this controller was started'
-LOST = 'the stop cannot be saved, so a restarted controller will not know it'
+LOST = 'the stop cannot be saved, so a restarted controller may not know it, or not its cause'
 
 
 class StopMemory:

@@ -18,6 +18,10 @@ from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.signals.body_state import Anomaly
 
 RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
+#: require a reset if a cause that would end a pause by itself has been present during a stop for
+#: this time [s]: meanwhile, a person may have begun to work at the arm. A jump of lengths, after
+#: which a verification may end a stop, takes 1 s.
+LASTING = 3.0
 
 
 class Activity(Enum):
@@ -94,6 +98,8 @@ class Supervisor:
         #: details; empty while running
         self._causes: dict[ConditionKind, Condition] = {}
         self._clear_for = 0.0  # time for which no cause of the stop has been present [s]
+        #: time for which an auto-recoverable cause has been present during a latched stop [s]
+        self._missed_for = 0.0
 
     @property
     def mode(self) -> str:
@@ -206,6 +212,10 @@ class Supervisor:
             released: Whether `hold_time` is over and the arm is released.
         """
         latching = [each for each in present if each.kind.clears is not Clears.CONDITION]
+        is_missing = self.is_latched and len(latching) < len(present)
+        self._missed_for = self._missed_for + elapsed if is_missing else 0.0
+        if self._missed_for > LASTING:
+            latching = list(present)
         if latching:
             self._latch(latching)
         elif present:

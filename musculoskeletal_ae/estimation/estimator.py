@@ -147,6 +147,7 @@ class Estimator:
         self._rejected = Persistence()  # why messages are rejected
         self.joint_stream = JointStream(robot)
         self.joint_check = JointSensorTrust(robot)
+        self._followed_trust = self.joint_trust  # that of the messages of `networks`
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
         self.networks.follow(self.body, self.received_at)
@@ -276,7 +277,11 @@ class Estimator:
                 length of the suspect muscle show that it is not repaired. Nothing changes then.
         """
         calibration = self._new_calibration(posture)
-        self._refuse_unrepaired(self._suspected(), 'zero')
+        finding = self.suspects.finding
+        # A length that jumped may be that of a tendon that ruptured while messages were lost.
+        is_of_one = finding is not None and finding.is_of_one_length
+        suspected = finding.muscles if finding and is_of_one else self._suspected()
+        self._refuse_unrepaired(suspected, 'zero')
         self._begin(calibration)
         self._accept_body()
 
@@ -295,8 +300,18 @@ class Estimator:
         usable = self.joint_stream.take(now, theta)
         impossible = self.joint_stream.impossible(now)
         self.joint_check.use_impossible({j: each.since for j, each in impossible.items()})
+        self._follow_joint_trust()
         is_usable = np.isfinite(usable)
         np.copyto(self._readings, [usable, np.full_like(usable, now)], where=is_usable)
+
+    def _follow_joint_trust(self) -> None:
+        """Discard the messages for the validation of networks if the trust has changed.
+
+        Readings of joint sensors so far may be wrong.
+        """
+        if self.joint_trust is not self._followed_trust:
+            self._followed_trust = self.joint_trust
+            self.networks.messages.clear()
 
     @property
     def joint_trust(self) -> JointTrust:
@@ -330,6 +345,7 @@ class Estimator:
                 'muscle is still isolated'
             )
         self._refuse_unrepaired(restored, 'restore')
+        self._note_checked(restored)
         if self.calibration is not None:  # the lengths of these muscles were not checked meanwhile
             self._note(Evidence.CALIBRATING, restored)
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
@@ -346,7 +362,9 @@ class Estimator:
                 calibration ends. The anomaly then stays.
         """
         isolating = tuple(isolating)
-        self._refuse_unrepaired(self._suspected(isolating), 'reset')
+        suspected = self._suspected(isolating)
+        self._refuse_unrepaired(suspected, 'reset')
+        self._note_checked(suspected)
         if self.body.offsets.revoked:
             raise MusculoskeletalError(f'{self.cause}; {self.advice}')
         self._accept_body(isolating)
@@ -366,7 +384,14 @@ class Estimator:
 
     # -- messages -------------------------------------------------------------------------------
 
-    def take(self, message: Any, time: float, now: float, delay: float = 0.0) -> Output | None:
+    def take(
+        self,
+        message: Any,
+        time: float,
+        now: float,
+        delay: float = 0.0,
+        recorded: Array | None = None,
+    ) -> Output | None:
         """Take a message of muscle_states: estimate the state, and check for faults.
 
         Args:
@@ -374,6 +399,8 @@ class Estimator:
             time: Time of the message [s].
             now: Time on the steady clock [s].
             delay: How late the message is, compared with the fastest one [s].
+            recorded: Joint angles of a recording [rad], (D,), on which networks are validated; None
+                for those that joint sensors have measured (`joints`).
 
         Returns:
             The results; None without a network, or before the first estimate of the length offsets.
@@ -389,7 +416,11 @@ class Estimator:
             if error.readings is not None:
                 self._handle(self.health.read(error.readings, self.body.used, now), now)
             raise
-        return self._use_sample(sample, now)
+        output = self._use_sample(sample, now)
+        if output is not None and self.body.offsets.known:
+            used, theta = output.sample, self.measured if recorded is None else recorded
+            self.networks.message(used.tension_read, used.length, used.sliding, now, theta)
+        return output
 
     def posture_of_marker(self, pose: pin.SE3) -> Array:
         """Return a posture in which the end effector has a given pose.
@@ -482,10 +513,6 @@ class Estimator:
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
             self._check(sample, estimated, readings, now)
             contact = self.load
-        if self.body.offsets.known:
-            self.networks.message(
-                sample.tension_read, sample.length, sample.sliding, now, self.measured
-            )
         self.output = Output(sample, estimated.state, estimated.anomaly, contact)
         return self.output
 
@@ -516,10 +543,9 @@ class Estimator:
                 self.healthy_torque.step(torque, self.contact.velocity, sent_apart)
                 self.mounting.step(estimated.state.theta, pull, torque, dt)
         if known and self.suspects.finding is None:
-            load, trust = 0.0 if self.load is None else self.load.distance, self.joint_trust
+            load = 0.0 if self.load is None else self.load.distance
             self.joint_check.step(observation, readings, now, load)
-            if self.joint_trust is not trust:
-                self.networks.messages.clear()  # the readings so far may be wrong
+            self._follow_joint_trust()
 
     # -- findings, verification and calibration -------------------------------------------------
 
@@ -602,6 +628,11 @@ class Estimator:
         if finding is None or not finding.kind.is_damage or finding.muscle in isolating:
             return []
         return [muscle for muscle in finding.muscles if muscle not in isolating]
+
+    def _note_checked(self, muscles: Iterable[int]) -> None:
+        """Note that lengths which changed in a repair have been checked."""
+        moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
+        self._note(Evidence.CHECKED, moved)
 
     def _refuse_unrepaired(self, muscles: Iterable[int], service: str) -> None:
         """Refuse a service if the readings of these muscles contradict the rest of the arm.

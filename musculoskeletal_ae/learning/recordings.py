@@ -225,9 +225,8 @@ def learn(
             newest = learner.mae
         reading = MuscleReadings(length=length, tension=tension)
         learner.joints(at, theta)
-        estimator.joints(theta, at)
         with suppress(RejectionError):  # the learner counts it
-            estimator.take(reading, at, at)
+            estimator.take(reading, at, at, recorded=theta)
         finding = estimator.suspects.finding
         if finding is not None and not stop:
             learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, finding.muscle))

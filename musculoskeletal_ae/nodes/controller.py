@@ -275,7 +275,7 @@ class ControllerNode(Shell):
         present = self.core.reset(time.monotonic())
         if present is not None:
             is_anomaly = present.kind is ConditionKind.ANOMALY
-            if is_anomaly and self.core.stream.body.verified is not None:
+            if is_anomaly and self.core.supervisor.ends_by_itself:
                 raise MusculoskeletalError(
                     f'refused: {present.text}; the muscle is being verified; wait until the '
                     f'verification has ended, within {LONGEST:g} s; the arm then moves on by '

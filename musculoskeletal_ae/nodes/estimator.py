@@ -114,7 +114,8 @@ class EstimatorNode(Shell):
     def _accepted(self, mae: Mae) -> None:
         self.candidates.publish(mae)
         # The length calibration needs a network, so it begins with the first one.
-        if Evidence.NOT_CALIBRATED in self.core.trust.evidence:
+        is_first = Evidence.NOT_CALIBRATED in self.core.trust.evidence
+        if is_first and not self.core.body.has_anomaly:
             self.core.calibrate_lengths(self.parameter('zero_posture'))
             self._publish_body()
 

@@ -14,6 +14,7 @@ from robots import write_robot
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
 from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
+from musculoskeletal_ae.control.supervisor import LASTING
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
@@ -509,6 +510,19 @@ def test_a_gap_of_estimates_interrupts_a_verification_and_does_not_latch_the_sto
     bench.end_anomaly()
     bench.step(2)
     assert bench.cause == ''
+
+
+def test_after_a_long_gap_of_data_during_a_verification_only_a_reset_moves_the_arm():
+    bench = VerificationBench(max_age=0.05)
+    bench.wound(round((bench.core.settings.hold_time + PAYING_OUT) / 0.01) + 3)
+    bench.blind = {'estimate'}
+    bench.wound(round(1.2 * LASTING / 0.01))  # a person may be at the arm by now
+    assert not bench.core.supervisor.ends_by_itself
+    bench.blind = set()
+    bench.end_anomaly()
+    bench.step(50)
+    assert bench.core.supervisor.mode == 'stopped'
+    assert bench.core.reset(bench.now) is None
 
 
 def test_a_verification_whose_suspect_is_in_use_again_is_abandoned_while_the_anomaly_lasts():

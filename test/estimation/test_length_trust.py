@@ -72,7 +72,8 @@ def test_a_revoked_offset_keeps_its_value_and_its_deviation():
 def test_an_offset_that_moved_in_a_repair_stays_known_until_the_next_calibration():
     trust = calibrated()
     before = trust.offsets
-    assert not trust.take(Evidence.MOVED, [1])
+    for evidence in (Evidence.MOVED, Evidence.CHECKED):
+        assert not trust.take(evidence, [1])
     assert trust.offsets is before
     assert trust.offsets.known
     assert np.flatnonzero(~trust.is_certain).tolist() == [1]

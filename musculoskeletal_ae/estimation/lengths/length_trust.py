@@ -9,7 +9,7 @@ on `body_state`, and all other nodes follow it.
     start ── ASSUMED ───────────────────► KNOWN ── a finding that revokes offsets ──► REVOKED
     start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN
     any ──── CALIBRATING ───────────────► UNKNOWN, for the muscles that are calibrated
-    KNOWN ── MOVED ─────────────────────► KNOWN, but the next calibration determines it anew
+    KNOWN ── MOVED, then CHECKED ───────► KNOWN, but the next calibration determines it anew
 
 The estimator itself knows that it has restarted, because it saves its offsets (`body_memory`).
 """
@@ -37,11 +37,13 @@ class Evidence(Enum):
     RESTARTED = 'not calibrated since the estimator was restarted'
     CALIBRATING = 'being calibrated'
     CALIBRATED = 'calibrated'
-    MOVED = 'changed while the muscle was repaired'
+    MOVED = 'changed while the muscle was repaired; not checked yet'
+    CHECKED = 'checked after the repair of the muscle'
 
 
 #: evidence after which an offset is unknown until a calibration has found it
 UNSURE = frozenset({Evidence.NOT_CALIBRATED, Evidence.RESTARTED, Evidence.CALIBRATING})
+REPAIRED = frozenset({Evidence.MOVED, Evidence.CHECKED})
 
 
 class LengthTrust:
@@ -77,7 +79,7 @@ class LengthTrust:
         """
         previous, is_finding = self.offsets, isinstance(evidence, ConditionKind)
         concerned = list(range(len(self.evidence)) if muscles is None else muscles)
-        if is_finding or evidence is Evidence.MOVED:  # these concern known offsets only
+        if is_finding or evidence in REPAIRED:  # these concern known offsets only
             concerned = [m for m in concerned if previous.trust[m] == Trust.KNOWN]
         for muscle in concerned:
             self.evidence[muscle] = evidence
@@ -97,7 +99,7 @@ class LengthTrust:
 
         They are known and precise, and their muscle has not been repaired since.
         """
-        is_moved = np.array([evidence is Evidence.MOVED for evidence in self.evidence])
+        is_moved = np.array([evidence in REPAIRED for evidence in self.evidence])
         is_precise = self.offsets.deviation < PRECISE
         return (self.offsets.trust == Trust.KNOWN) & is_precise & ~is_moved
 
