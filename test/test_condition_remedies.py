@@ -178,7 +178,7 @@ def test_a_stop_is_saved_once_the_directory_can_be_written(tmp_path, monkeypatch
     arm.rename(tmp_path / 'moved')
     arm.write_text('')  # a file in place of the directory
     memory.note(Kind.OPERATOR.condition())
-    assert 'a restarted controller will not know it' in memory.problem
+    assert 'the stop cannot be saved' in memory.problem
     arm.unlink()
     memory.note(Kind.OPERATOR.condition())
     assert memory.problem == ''

@@ -99,7 +99,7 @@ def test_a_stop_that_cannot_be_written_is_reported(tmp_path):
     shutil.rmtree(arm)
     arm.write_text('')  # a file in place of the directory
     memory.note(STOP)
-    assert 'a restarted controller will not know it' in memory.problem
+    assert 'the stop cannot be saved' in memory.problem
 
 
 def test_without_a_directory_nothing_is_kept():
