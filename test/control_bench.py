@@ -74,7 +74,8 @@ class Bench:
     """A controller with healthy sensor data, unless a test changes them."""
 
     def __init__(self, mae=None, **chosen):
-        # The arm of the bench does not move by itself, so all its movements take equally long.
+        # The arm of the bench stands still whatever is commanded. Unless a test states durations,
+        # movements to a target take as long as the first one.
         settings = Settings(**chosen)
         if 'target_duration' not in chosen:
             settings = replace(settings, target_duration=settings.first_duration)

@@ -57,7 +57,8 @@ class FollowedGoal:
         assert trajectory is not None
         self._core, self._trajectory = core, trajectory
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
-        self._ended_at: float | None = None  # time at which the trajectory had ended [s]
+        #: time at which the end of the trajectory was noticed [s]; None before its end
+        self._ended_at: float | None = None
 
     def outcome(self, time: float) -> tuple[int, str] | None:
         """Return an error code (0 for success) and its reason, or None while the goal is active.
@@ -86,7 +87,7 @@ class FollowedGoal:
             return None
         else:  # a method such as `tension` holds the end without the follower
             off = np.abs(trajectory.end - core.estimate)
-        # The clock may have jumped back.
+        # After a backward jump of the clock, measure the time since the end anew.
         self._ended_at = time if self._ended_at is None else min(self._ended_at, time)
         if missed := self._beyond(BEYOND_GOAL, off, self._goal):
             return missed if 0.0 < self._patience < time - self._ended_at else None

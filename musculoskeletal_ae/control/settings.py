@@ -52,6 +52,7 @@ METHODS = {
     'stiffness': ControlMethod(sets_stiffness=True),
     'float': ControlMethod(commands_tension=True, is_guided=True),
 }
+#: names of the control methods that command lengths
 BY_LENGTH = tuple(name for name, method in METHODS.items() if not method.commands_tension)
 
 

@@ -8,8 +8,8 @@ While a controller commands the arm, controller.stop contains the word `running`
 replaces this word by its cause. A controller that ends properly while no stop is latched deletes
 controller.stop. The file therefore remains if a stop was latched, or if the controller was killed
 or has crashed. A controller that finds controller.stop when it starts is stopped from the
-beginning, and moves the arm only after `controller/reset`. If the file names no cause, the cause is
-`restarted`.
+beginning. It moves the arm only after `controller/reset`, or after a verification that ends a stop
+by an anomaly. If the file names no cause, the cause is `restarted`.
 """
 
 from pathlib import Path

@@ -18,9 +18,9 @@ from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.signals.body_state import Anomaly
 
 RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
-#: require a reset if a cause that would end a pause by itself has been present during a stop for
-#: this time [s]: meanwhile, a person may have begun to work at the arm. A jump of lengths, after
-#: which a verification may end a stop, takes 1 s.
+#: If an auto-recoverable cause, such as stale data, has been present for this time during a stop
+#: [s], only a reset ends the stop, because somebody may have begun to work at the arm. A
+#: verification may still end a stop in which a length has jumped, which makes data stale for 1 s.
 LASTING = 3.0
 
 
@@ -99,7 +99,7 @@ class Supervisor:
         self._causes: dict[ConditionKind, Condition] = {}
         self._clear_for = 0.0  # time for which no cause of the stop has been present [s]
         #: time for which an auto-recoverable cause has been present during a latched stop [s]
-        self._missed_for = 0.0
+        self._lasting_for = 0.0
 
     @property
     def mode(self) -> str:
@@ -212,9 +212,9 @@ class Supervisor:
             released: Whether `hold_time` is over and the arm is released.
         """
         latching = [each for each in present if each.kind.clears is not Clears.CONDITION]
-        is_missing = self.is_latched and len(latching) < len(present)
-        self._missed_for = self._missed_for + elapsed if is_missing else 0.0
-        if self._missed_for > LASTING:
+        lasts = self.is_latched and len(latching) < len(present)
+        self._lasting_for = self._lasting_for + elapsed if lasts else 0.0
+        if self._lasting_for > LASTING:
             latching = list(present)
         if latching:
             self._latch(latching)

@@ -76,7 +76,7 @@ SLOPES = 0.2, 2.2
 #: count a column of an arm at rest as misplaced only if another muscle fits better by this factor
 BETTER_AT_REST = 2.5
 MOVED = 0.04  # check sign and scale of l only if it has varied by more than this [m]
-#: judge sign and order of the joint sensors only if the range of some θ is larger than this [rad]
+#: judge signs and order of the joint sensors only if a joint has moved by more than this [rad]
 MOVED_JOINT = 0.2
 MOST_SAMPLES = 400  # compare at most this many messages with the model, to save time
 #: units in which values may have been published by mistake, in SI units or °C

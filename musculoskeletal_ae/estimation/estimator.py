@@ -16,7 +16,7 @@ describes the sequence from a rupture to resuming.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -279,9 +279,9 @@ class Estimator:
         calibration = self._new_calibration(posture)
         finding = self.suspects.finding
         # A length that jumped may be that of a tendon that ruptured while messages were lost.
-        is_of_one = finding is not None and finding.is_of_one_length
-        suspected = finding.muscles if finding and is_of_one else self._suspected()
-        self._refuse_unrepaired(suspected, 'zero')
+        if finding is not None and (finding.kind.is_damage or finding.is_of_one_length):
+            # The calibration determines the lengths, so they need not fit yet.
+            self._refuse_unrepaired(finding.muscles, 'zero', RepairCheck.defect)
         self._begin(calibration)
         self._accept_body()
 
@@ -619,7 +619,7 @@ class Estimator:
         elif not self.body.offsets.known:
             self._note(jump_finding(jumped).kind, jumped)
 
-    def _suspected(self, isolating: tuple[int, ...] = ()) -> list[int]:
+    def _suspected(self, isolating: tuple[int, ...]) -> list[int]:
         """Return the muscles (indices) that must be repaired before the anomaly may end.
 
         There are none if the suspect muscle is among the muscles `isolating`.
@@ -634,21 +634,27 @@ class Estimator:
         moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
         self._note(Evidence.CHECKED, moved)
 
-    def _refuse_unrepaired(self, muscles: Iterable[int], service: str) -> None:
+    def _refuse_unrepaired(
+        self,
+        muscles: Iterable[int],
+        service: str,
+        problem: Callable[[RepairCheck, int], str] = RepairCheck.problem,
+    ) -> None:
         """Refuse a service if the readings of these muscles contradict the rest of the arm.
 
-        A length calibration (service `zero`) does not require that the lengths fit.
+        Args:
+            muscles: Indices of the muscles.
+            service: Name of the service without `estimator/`.
+            problem: Function that returns why a muscle must not be used yet, or ''.
 
         Raises:
             MusculoskeletalError: The text says what to repair.
         """
-        if (check := self._repair_check) is None:
-            return
-        problem = check.defect if service == 'zero' else check.problem
-        if problems := list(filter(None, map(problem, muscles))):
-            raise MusculoskeletalError(
-                f'{"; ".join(problems)}; then call estimator/{service} again'
-            )
+        check = self._repair_check
+        problems = [] if check is None else [problem(check, muscle) for muscle in muscles]
+        if problems := list(filter(None, problems)):
+            again = f'then call estimator/{service} again'
+            raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
 
     @property
     def _repair_check(self) -> RepairCheck | None:

@@ -53,7 +53,7 @@ class Finding:
 
 
 def jump_finding(jumped: tuple[int, ...]) -> Finding:
-    """Return the finding for one or several muscles whose lengths have jumped, and stay there.
+    """Return the finding that the lengths of one or several muscles have jumped, and stay changed.
 
     `signals/length_jumps.py` rejects messages with a jump. If the new lengths persist, messages are
     accepted again, and the first sample names these muscles (`MuscleSample.jumped`).

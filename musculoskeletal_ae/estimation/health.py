@@ -64,7 +64,7 @@ class HealthMonitor:
             detector.reset()
 
     def forget(self) -> None:
-        """Forget what was observed with other length offsets."""
+        """Forget all stored messages, because the length offsets have changed."""
         self.joints.forget()
         self._exchange.forget()
 

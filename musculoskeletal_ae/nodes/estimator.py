@@ -113,7 +113,8 @@ class EstimatorNode(Shell):
 
     def _accepted(self, mae: Mae) -> None:
         self.candidates.publish(mae)
-        # The length calibration needs a network, so it begins with the first one.
+        # The length calibration needs a network, so it begins with the first one. A network that is
+        # used again because of an anomaly is not the first one.
         is_first = Evidence.NOT_CALIBRATED in self.core.trust.evidence
         if is_first and not self.core.body.has_anomaly:
             self.core.calibrate_lengths(self.parameter('zero_posture'))
@@ -252,7 +253,6 @@ class EstimatorNode(Shell):
         if body.has_anomaly and not before.has_anomaly:
             text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
             self.get_logger().warning(text)
-        if body.has_anomaly and not before.has_anomaly:
             self.candidates.give_up()
         if body.has_anomaly != before.has_anomaly:
             self._report()  # at once, because the report names the suspect

@@ -103,8 +103,7 @@ def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     first = estimator.core.complete_mae
     arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
 
-    # The network is validated in many steps. An anomaly begins again and again until one of them
-    # has been interrupted.
+    # An anomaly begins again and again, until one begins while the network is being validated.
     def is_decided():
         find(estimator.core)
         return decisions

@@ -34,6 +34,8 @@ class MissingValues:
     def step(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
         """Report the only muscle with NaN in a message, if it has reported NaN for 0.15 s.
 
+        The result is None if there is nothing to report.
+
         Args:
             readings: The readings.
             usable: Whether each muscle is used, (M,).

@@ -43,6 +43,7 @@ class Evidence(Enum):
 
 #: evidence after which an offset is unknown until a calibration has found it
 UNSURE = frozenset({Evidence.NOT_CALIBRATED, Evidence.RESTARTED, Evidence.CALIBRATING})
+#: evidence that a length has changed in a repair, which leaves the offset known
 REPAIRED = frozenset({Evidence.MOVED, Evidence.CHECKED})
 
 

@@ -68,7 +68,7 @@ def comparisons(
 def worse_length(
     errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
 ) -> str:
-    """Return a text on the muscle whose length a network explains clearly worse than another.
+    """Return a text on the muscle whose length a network computes clearly worse than that in use.
 
     The arguments are those of `comparisons`.
 
