@@ -33,11 +33,9 @@ from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.isolation import SuspectHandling
-from musculoskeletal_ae.estimation.joint_sensor_trust import JointSensorTrust
 from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
-from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import LARGEST_LEARNED, LARGEST_YOUNG, RepairCheck
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
@@ -96,13 +94,11 @@ class Estimator:
         calibration: The running length calibration, or None.
         contact: Estimates the external load, and detects contact.
         healthy_torque: Measures the external torque that is wrongly estimated without contact.
-        mounting: Checks the direction of gravity.
         networks: Decides which network is used.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
         joint_stream: Judges single readings of the joint sensors.
-        joint_check: Decides which joint sensors are trusted.
         measured: Joint angles from joint sensors [rad], (D,), at the last message with an estimate;
             None unless all joint sensors are trusted and reported a usable value within 0.05 s
             before that message.
@@ -133,7 +129,6 @@ class Estimator:
         self.calibration: LengthCalibration | None = None
         self.contact = ContactEstimator(robot)
         self.healthy_torque = HealthyTorque(robot.joint_count)
-        self.mounting = MountingCheck(robot)
         self.networks = CheckpointValidator(robot, self.use)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
@@ -146,7 +141,6 @@ class Estimator:
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
         self.joint_stream = JointStream(robot)
-        self.joint_check = JointSensorTrust(robot)
         self._followed_trust = self.joint_trust  # that of the messages of `networks`
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
@@ -202,9 +196,7 @@ class Estimator:
         mae = self.healthy_torque.put_into(mae)
         reduced = mae.without(self.body.isolated)
         self.health.use(reduced)
-        self.joint_check.use(reduced)
         self.contact.use(reduced)
-        self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
         self.complete_mae, self.mae = mae, reduced
         self.needed_muscles = needed_muscles(self.robot, reduced)
@@ -299,7 +291,7 @@ class Estimator:
         """
         usable = self.joint_stream.take(now, theta)
         impossible = self.joint_stream.impossible(now)
-        self.joint_check.use_impossible({j: each.since for j, each in impossible.items()})
+        self.health.joint_sensors.use_impossible({j: each.since for j, each in impossible.items()})
         self._follow_joint_trust()
         is_usable = np.isfinite(usable)
         np.copyto(self._readings, [usable, np.full_like(usable, now)], where=is_usable)
@@ -316,7 +308,7 @@ class Estimator:
     @property
     def joint_trust(self) -> JointTrust:
         """The trust in each joint sensor, with times on the steady clock."""
-        return self.joint_check.trust
+        return self.health.joint_sensors.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
         """Confirm that the joint sensors are right, because a user says so.
@@ -327,7 +319,7 @@ class Estimator:
         Returns:
             Indices of the joints whose sensors were in doubt or missing.
         """
-        return (*self.joint_check.confirm(), *self.joint_stream.do_without_missing())
+        return (*self.health.joint_sensors.confirm(), *self.joint_stream.do_without_missing())
 
     def restore(self, muscles: Iterable[int]) -> None:
         """Restore isolated muscles (indices); muscles that are not isolated are ignored.
@@ -371,8 +363,7 @@ class Estimator:
 
     def _accept_body(self, isolating: tuple[int, ...] = ()) -> None:
         """Consider the body healthy in its present state, and clear a finding."""
-        self.health.heat.accept(*range(self.robot.muscle_count))
-        self.mounting.reset()
+        self.health.accept()
         self.isolate([*self.suspects.clear(self.body.isolated), *isolating])
 
     def clock_jumped_back(self) -> None:
@@ -455,7 +446,7 @@ class Estimator:
 
     def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
         self._rejected.note('', now)
-        read = sample.newest.replace(length=sample.length_read)
+        read = sample.newest.replace(length=sample.length_read, tension=sample.tension_read)
         self._handle(self.health.read(read, self.body.used, now), now)
         if sample.jumped:
             self._handle_jump(sample.jumped, now)
@@ -532,19 +523,18 @@ class Estimator:
         known = self.body.offsets.known
         demand = self._commands.demand(self.robot, sample, now)
         command = self._commands.length(sample, now)
-        observation = Observation(sample, estimated, demand, dt, known, self.measured, command)
+        observation = Observation(
+            sample, estimated, demand, dt, known, self.measured, command, joints=readings, now=now
+        )
         self._handle(self.health.step(observation), now)
         self.load = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
             self.load = self.contact.step(estimated.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
-                torque = self.load.torque
-                self.healthy_torque.step(torque, self.contact.velocity, sent_apart)
-                self.mounting.step(estimated.state.theta, pull, torque, dt)
+                self.healthy_torque.step(self.load.torque, self.contact.velocity, sent_apart)
         if known and self.suspects.finding is None:
-            load = 0.0 if self.load is None else self.load.distance
-            self.joint_check.step(observation, readings, now, load)
+            self.health.step_healthy(observation, self.load)
             self._follow_joint_trust()
 
     # -- findings, verification and calibration -------------------------------------------------
@@ -582,10 +572,9 @@ class Estimator:
         self.stream.use_body(self.body)
         self.networks.follow(self.body, self.received_at)
         if body.has_anomaly and not before.has_anomaly:
-            self.joint_check.drop_newest()
+            self.health.joint_sensors.drop_newest()
         if (body.offsets.offset != before.offsets.offset).any():
             self.health.forget()
-            self.joint_check.forget()
 
     def _measured_theta(self, readings: Array) -> Array | None:
         """Return the readings [rad], (D,), if they show the posture of all joints, else None.

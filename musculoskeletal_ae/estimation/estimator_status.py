@@ -50,12 +50,10 @@ def report(core: Estimator, now: float) -> Report:
 
 def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
     """Return all conditions of the readings, the body and the network; `now` is as in `report`."""
-    present = [*_finding(core), *_changed_modules(core), *_isolated(core), *_unknown_offsets(core)]
-    present += [*_doubted_joints(core), *_unreadable_joints(core, now)]
+    present = [*_finding(core), *_isolated(core), *_unknown_offsets(core)]
+    present += [*core.health.conditions(), *_unreadable_joints(core, now)]
     if reason := core.rejected_because(now):
         present.append(ConditionKind.READINGS_REJECTED.condition(reason))
-    if core.mounting.tilt is not None:
-        present.append(ConditionKind.OTHER_MOUNTING.condition(core.mounting.tilt.text))
     if weakness := core.networks.unsuitable_because:
         present.append(ConditionKind.UNSUITABLE_NETWORK.condition(weakness))
     if core.mae is None:
@@ -73,12 +71,6 @@ def _finding(core: Estimator) -> Iterator[Condition]:
     if core.suspects.verification is not None:
         detail += f' (the muscle is being verified; this ends by itself within {LONGEST:g} s)'
     yield finding.kind.condition(detail, names, level='error', steps=core.remedy)
-
-
-def _changed_modules(core: Estimator) -> Iterator[Condition]:
-    for muscle, change in core.health.heat.changed.items():
-        name = core.robot.muscles[muscle]
-        yield ConditionKind.MODULE_CHANGED.condition(f'the module of {name} {change}', [name])
 
 
 def _isolated(core: Estimator) -> Iterator[Condition]:
@@ -118,17 +110,6 @@ def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
         names = [core.robot.muscles[muscle] for muscle in faulty]
         steps = calibration.remedy or stuck.steps
         yield stuck.condition(calibration.problem, names, steps=steps)
-
-
-def _doubted_joints(core: Estimator) -> Iterator[Condition]:
-    trust, robot = core.joint_trust, core.robot
-    if trust.doubted:
-        detail = ', '.join(
-            f'{robot.joints[j]} by {robot.units[j].position_text(trust.deviation[j], "+.2f")}'
-            for j in trust.doubted
-        )
-        names = [robot.joints[j] for j in trust.doubted]
-        yield ConditionKind.JOINT_SENSORS_DOUBTED.condition(detail, names)
 
 
 def _unreadable_joints(core: Estimator, now: float) -> Iterator[Condition]:

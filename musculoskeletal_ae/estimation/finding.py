@@ -1,14 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observations and findings of detectors, and the interface of all detectors."""
+"""Observations and findings of detectors, and the interface of all detectors.
+
+For each message, the estimator calls the methods of all detectors (`Detector`) in this order:
+
+    read          every message of a legal shape, also without a network, and if it is rejected
+    step          a message for which there is an estimate
+    step_healthy  the same message, unless there is an anomaly or a length offset is unknown
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.conditions import ConditionKind, Revokes
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.conditions import Condition, ConditionKind, Revokes
+from musculoskeletal_ae.estimation.contact import Contact
 from musculoskeletal_ae.estimation.estimate import Estimate
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: discard messages that arrived within this time before a fault was detected [s], because the fault
@@ -78,6 +88,9 @@ class Observation:
         lengths_known: Whether the length offsets are known.
         measured: Joint angles from joint sensors [rad], (D,); None unless all are measured.
         command: Target lengths of the muscle modules [m], (M,); None without a length command.
+        joints: Usable readings of the joint sensors [rad], (D,), also of sensors that are not
+            trusted; NaN for joints without a reading. None if no readings are stated.
+        now: Time of the message on a steady clock [s].
     """
 
     sample: MuscleSample
@@ -87,13 +100,16 @@ class Observation:
     lengths_known: bool = True
     measured: Array | None = None
     command: Array | None = None
+    joints: Array | None = None
+    now: float = 0.0
 
 
 class Detector:
-    """Base class of the detectors, each of which looks for one sign of a fault.
+    """Base class of the detectors, each of which watches the readings for one kind of fault.
 
-    `SuspectHandling` latches their findings. A new detector overrides `step`, and other methods as
-    needed. To use a new detector, add it to the list in `HealthMonitor`.
+    A fault that stops the arm or isolates a muscle is returned as a `Finding`, which
+    `SuspectHandling` latches. A fault that only warns is a condition. All methods do nothing here;
+    a new detector overrides those that it needs. To use it, add it to the list in `HealthMonitor`.
     """
 
     def use(self, mae: Mae) -> None:
@@ -102,6 +118,32 @@ class Detector:
     def reset(self) -> None:
         """Reset the detector, for example after a jump of the clock or a reset by the user."""
 
-    def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
+    def forget(self) -> None:
+        """Forget all stored messages, because the length offsets have changed."""
+
+    def accept(self) -> None:
+        """Accept the present state of the body as healthy, because a user says so."""
+
+    def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
+        """Check the readings of a message, even of a rejected one; return a finding or None.
+
+        Args:
+            readings: The readings as the sensors measured them; NaN where they are unknown.
+            usable: Whether each muscle is used, (M,).
+            now: Time of the message on a steady clock [s].
+        """
+
+    def step(self, observation: Observation) -> Finding | None:
         """Check a message for which the network has made an estimate; return a finding or None."""
-        return None
+
+    def step_healthy(self, observation: Observation, load: Contact | None) -> None:
+        """Check a message of an arm without an anomaly, whose length offsets are known.
+
+        Args:
+            observation: The message, which all detectors have checked by `step`.
+            load: The external load; None on a robot whose tensions are unknown.
+        """
+
+    def conditions(self) -> Iterable[Condition]:
+        """Return the conditions of which users should know, as long as they are present."""
+        return ()

@@ -5,14 +5,20 @@ A new detector is one file in `estimation/detectors/` and one entry in the list 
 The estimator, offline learning (`train --from-bag`) and the experiments use the same list.
 """
 
+from collections.abc import Iterator
+
 from musculoskeletal_ae.arrays import Bools
+from musculoskeletal_ae.conditions import Condition
+from musculoskeletal_ae.estimation.contact import Contact
+from musculoskeletal_ae.estimation.detectors.exchange import ExchangeCheck
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
+from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import JointSensorTrust
 from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
+from musculoskeletal_ae.estimation.detectors.mounting import MountingCheck
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation, jump_finding
-from musculoskeletal_ae.estimation.lengths.exchange import ExchangeCheck
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
@@ -26,7 +32,7 @@ class HealthMonitor:
     Attributes:
         residual: The detector that compares the network's residual with its healthy spread; it also
             names the most suspect muscle.
-        joints: The detector of lengths that disagree with joint sensors.
+        joint_sensors: The detector that decides which joint sensors are trusted.
         heat: Thermal models of the muscle modules, which the caller updates.
     """
 
@@ -39,24 +45,27 @@ class HealthMonitor:
         """
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot)
-        self.joints = LengthDisagreement(robot)
         self.heat = Heat(robot)
+        self.joint_sensors = JointSensorTrust(robot)
         self._exchange = ExchangeCheck(robot)
-        self._missing = MissingValues(robot)
+        #: if several report a finding for the same message, only that of the first one counts
         self._detectors: list[Detector] = [
             *by_physics,
             self.residual,
-            self.joints,
+            LengthDisagreement(robot),
             FrozenSensor(robot),
             SaturatedSensor(robot),
-            ThermalDrift(self.heat),
+            ThermalDrift(robot, self.heat),
+            MissingValues(robot),
+            self._exchange,
+            self.joint_sensors,
+            MountingCheck(robot),
         ]
 
     def use(self, mae: Mae) -> None:
         """Use another network; its isolated muscles are ignored."""
         for detector in self._detectors:
             detector.use(mae)
-        self._exchange.use(mae)
 
     def reset(self) -> None:
         """Reset all detectors, for example after a jump of the clock or a reset by the user."""
@@ -65,19 +74,21 @@ class HealthMonitor:
 
     def forget(self) -> None:
         """Forget all stored messages, because the length offsets have changed."""
-        self.joints.forget()
-        self._exchange.forget()
+        for detector in self._detectors:
+            detector.forget()
+
+    def accept(self) -> None:
+        """Accept the present state of the body as healthy, because a user says so."""
+        for detector in self._detectors:
+            detector.accept()
 
     def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
-        """Check the readings of a message, even of a rejected one; return a finding or None.
+        """Check the readings of a message, even of a rejected one; return the first finding.
 
-        Args:
-            readings: The readings, with lengths as the sensors measured them.
-            usable: Whether each muscle is used, (M,).
-            now: Time of the message on a steady clock [s].
+        `Detector.read` describes the arguments.
         """
-        self._exchange.read(readings, now)
-        return self._missing.step(readings, usable, now)
+        findings = [detector.read(readings, usable, now) for detector in self._detectors]
+        return next(filter(None, findings), None)
 
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which there is an estimate; return the first finding or None.
@@ -88,5 +99,14 @@ class HealthMonitor:
         findings = [detector.step(observation) for detector in self._detectors]
         if (jumped := observation.sample.jumped) and observation.lengths_known:
             findings.insert(0, jump_finding(jumped))
-        self._exchange.note(observation)
         return self._exchange.explain(next(filter(None, findings), None), observation)
+
+    def step_healthy(self, observation: Observation, load: Contact | None) -> None:
+        """Check a message of an arm without an anomaly again, as in `Detector.step_healthy`."""
+        for detector in self._detectors:
+            detector.step_healthy(observation, load)
+
+    def conditions(self) -> Iterator[Condition]:
+        """Yield the conditions of all detectors."""
+        for detector in self._detectors:
+            yield from detector.conditions()

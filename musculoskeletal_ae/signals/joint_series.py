@@ -17,7 +17,7 @@ Encoders may count whole turns, or wrap around at 0 or π. Whole turns are there
 readings if the remaining angles are continuous and within the joint limits.
 
 If a sensor still has impossible readings again and again, none of its readings during that time is
-usable, as on a running arm (`estimation/joint_sensor_trust.py`).
+usable, as on a running arm (`estimation/detectors/joint_sensor_trust.py`).
 """
 
 from collections import defaultdict

@@ -13,7 +13,8 @@ example that of another program.
 
 The level of a sensor changes if the sensor slips on its axis. The new level is accepted after all
 readings have followed each other plausibly for `LIMITS.settled`. This file cannot say which level
-is right: the estimator compares both with the muscle lengths (`estimation/joint_sensor_trust.py`).
+is right: the estimator compares both with the muscle lengths
+(`estimation/detectors/joint_sensor_trust.py`).
 
 Each node that reads the messages drops single readings with its own stream, as with `MuscleStream`.
 Only the estimator decides whether a sensor with a lasting fault is trusted, and publishes this

@@ -2,9 +2,9 @@
 """Which joint sensors to trust, as the estimator has decided.
 
 The estimator compares the joint sensors with the muscle lengths, and watches for impossible
-readings that persist (`estimation/joint_sensor_trust.py`). It publishes its decision on the latched
-topic `joint_sensor_trust`. No other code judges whether a plausible reading is right. Every change
-creates a new `JointTrust`.
+readings that persist (`estimation/detectors/joint_sensor_trust.py`). It publishes its decision on
+the latched topic `joint_sensor_trust`. No other code judges whether a plausible reading is right.
+Every change creates a new `JointTrust`.
 """
 
 from __future__ import annotations

@@ -10,9 +10,11 @@ import pytest
 from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation import health
 from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.finding import Detector
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
@@ -239,6 +241,41 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
         isolates(now + 0.01 * n)
     assert core.body.isolated == (2,)
     assert not core.cause  # missing numbers need no verification, so the arm does not stop
+
+
+def test_a_new_entry_in_the_list_of_detectors_warns_of_rejected_readings_until_a_reset(
+    robot, healthy, monkeypatch
+):
+    class HasReadNan(Detector):
+        def __init__(self, _):
+            self.count = 0
+
+        def read(self, readings, usable, _):
+            self.count += np.count_nonzero(np.isnan(readings.length) & usable)
+
+        def accept(self):
+            self.count = 0
+
+        def conditions(self):
+            if self.count:
+                yield ConditionKind.OTHER_MOUNTING.condition(f'{self.count} readings')
+
+    monkeypatch.setattr(health, 'MountingCheck', HasReadNan)
+    core = Estimator(robot)  # without a network
+    broken = states(healthy)
+    broken[0, 2] = np.nan
+
+    def warnings(now):
+        report = core.report(now).conditions
+        return [each.text for each in report if each.identifier == 'other_mounting']
+
+    core.take(reading(states(healthy)), 0.0, 0.0)
+    assert not warnings(0.0)
+    with pytest.raises(RejectionError):
+        core.take(message_of(broken), DT, DT)
+    assert [text.rpartition(': ')[2] for text in warnings(DT)] == ['1 readings']
+    core.reset()
+    assert not warnings(DT)
 
 
 @pytest.mark.parametrize('row', [0, 1])

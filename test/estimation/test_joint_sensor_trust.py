@@ -2,11 +2,12 @@
 """False joint sensors are named; systematic offsets and changed muscles are not."""
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.estimation.joint_sensor_trust import JointSensorTrust
+from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import JointSensorTrust
 from musculoskeletal_ae.experiments.detection import observe
 from musculoskeletal_ae.signals.joint_trust_message import SensorTrust
 
@@ -30,7 +31,9 @@ class Arm:
             tension = self.robot.tension.bias + self.rng.uniform(10.0, 60.0, 6)
             length = self.robot.muscle_lengths(theta, tension) + longer
             observation = observe(self.mae, length, tension, tension, DT)
-            self.check.step(observation, read(theta.copy(), self.time - begin), self.time)
+            joints = read(theta.copy(), self.time - begin)
+            observation = replace(observation, joints=joints, now=self.time)
+            self.check.step_healthy(observation, None)
 
     @property
     def doubted(self):

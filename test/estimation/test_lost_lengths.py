@@ -514,7 +514,7 @@ def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
     arm.joint_off = np.full(2, np.nan)
     arm.go(6.0)
     assert arm.kind is None
-    assert arm.core.health.joints.gap is None
+    assert arm.core.measured is None
 
 
 def isolated_for(arm, seconds):

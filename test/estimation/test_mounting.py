@@ -6,7 +6,10 @@ import pinocchio as pin
 import pytest
 from exact_mae import ExactMae
 
-from musculoskeletal_ae.estimation.mounting import MountingCheck
+from musculoskeletal_ae.estimation.contact import Contact
+from musculoskeletal_ae.estimation.detectors.mounting import MountingCheck
+from musculoskeletal_ae.experiments.detection import observe
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
@@ -20,7 +23,7 @@ class Exploring:
     def __init__(self, gravity, payload=0.0, push=0.0, seed=0):
         self.gravity, self.payload, self.push = gravity, payload, push
         self.mae, self.rng = ExactMae(ARM), np.random.default_rng(seed)
-        self.mae.is_calibrated = True
+        self.mae.is_calibrated, self.mae.isolated = True, ()
         self.model = pin.Model(ARM.kinematics.model)
         self.model.gravity.linear = gravity
         self.dt = 1.0  # time between two messages [s]
@@ -42,8 +45,12 @@ class Exploring:
             return
         read = tension * self.gain + self.rng.normal(0.0, 5.0, len(tension))
         torque = kinematics.holding_torque(theta) + read @ jacobian
+        length = self.mae.lengths(theta, read)
+        state = State(theta, read, length)
+        observation = observe(self.mae, length, read, read, self.dt, state=state)
+        load = Contact(torque, lambda: np.zeros(3), np.nan, False)
         for _ in range(times):
-            self.check.step(theta, read, torque, self.dt)
+            self.check.step_healthy(observation, load)
 
 
 @pytest.mark.parametrize('angle', [45.0, 90.0, 180.0])
@@ -56,7 +63,10 @@ def test_a_turned_base_is_found_with_the_direction_of_gravity(angle, axis):
     tilt = arm.check.tilt
     assert tilt.angle == pytest.approx(angle, abs=20.0)
     assert tilt.direction @ gravity / 9.81 > np.cos(np.radians(25.0))
-    assert 'robot.urdf' in tilt.text
+    (condition,) = arm.check.conditions()
+    assert condition.identifier == 'other_mounting' and 'robot.urdf' in condition.text
+    arm.check.accept()
+    assert not [*arm.check.conditions()]
 
 
 def test_a_base_that_is_turned_while_the_arm_works_is_found_and_so_is_its_return():

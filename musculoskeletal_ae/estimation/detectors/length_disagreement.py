@@ -109,18 +109,15 @@ UNEXPLAINED = 0.5
 
 
 class LengthDisagreement(Detector):
-    """Reports muscle lengths that contradict the joint sensors.
-
-    Attributes:
-        gap: Measured minus computed length of each muscle [m], (M,), as the median over the last
-            second; 0 for isolated muscles. None without measurements of all joints.
-    """
+    """Reports muscle lengths that contradict the joint sensors."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._mae: Mae | None = None
         self._used: Bools = np.ones(robot.muscle_count, dtype=bool)
-        self.gap: Array | None = None
+        #: measured minus computed length of each muscle [m], (M,), as the median over the last
+        #: second; 0 for isolated muscles; None without measurements of all joints
+        self._gap: Array | None = None
         #: θ, T_end and l of healthy messages, from which g_usual of any network follows; l is NaN
         #: for muscles that were isolated
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
@@ -141,7 +138,7 @@ class LengthDisagreement(Detector):
         """Reset the detector: discard messages of the last second, keep healthy messages."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
-        self.gap = None
+        self._gap = None
 
     def forget(self) -> None:
         """Forget all messages, also the healthy ones, because the length offsets have changed."""
@@ -173,20 +170,20 @@ class LengthDisagreement(Detector):
             self._unmeasured += dt
             if self._unmeasured > COUNT * SPACING:  # earlier values are out of date
                 self._recent.clear()
-                self.gap, self._beyond = None, 0.0
+                self._gap, self._beyond = None, 0.0
             return None
         self._unmeasured = 0.0
         sample, theta = observation.sample, observation.measured
         self._recent.append(sample.length - self._mae.lengths(theta, sample.bone_tension))
         if len(self._recent) < COUNT:
             return None
-        self.gap = np.median(np.array(self._recent), axis=0) * self._used
-        excess = self._excess(self.gap)
+        self._gap = np.median(np.array(self._recent), axis=0) * self._used
+        excess = self._excess(self._gap)
         self._beyond = self._beyond + dt if excess > 1.0 else 0.0
         if not observation.lengths_known:
             return None
         known = self._used & self._has_usual
-        if excess <= 1.0 and self._excess(self.gap * known) <= HEALTHY_EXCESS:
+        if excess <= 1.0 and self._excess(self._gap * known) <= HEALTHY_EXCESS:
             self._note_healthy(theta, sample, dt)
         return self._finding(observation) if self._beyond > LASTING else None
 
@@ -222,9 +219,9 @@ class LengthDisagreement(Detector):
 
     def _finding(self, observation: Observation) -> Finding | None:
         assert self._mae is not None
-        assert self.gap is not None
+        assert self._gap is not None
         assert observation.measured is not None
-        change, largest = self._change(self.gap)
+        change, largest = self._change(self._gap)
         muscle = int(np.abs(change).argmax())
         if self._is_ruptured(muscle, observation.sample, change, largest):
             short = f'{-1e3 * change[muscle]:.0f} mm shorter than expected in the measured posture'

@@ -11,18 +11,15 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.finding import Finding
+from musculoskeletal_ae.estimation.finding import Detector, Finding
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 SILENT = 0.15  # report a muscle once it alone has reported NaN for this long [s]
 
 
-class MissingValues:
-    """Reports a muscle that alone has reported NaN for 0.15 s (SILENT).
-
-    Unlike the detectors, it also checks messages that are rejected.
-    """
+class MissingValues(Detector):
+    """Reports a muscle that alone has reported NaN for 0.15 s (SILENT)."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -31,15 +28,10 @@ class MissingValues:
         #: message [s]
         self._since = self._last = -math.inf
 
-    def step(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
+    def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
         """Report the only muscle with NaN in a message, if it has reported NaN for 0.15 s.
 
         The result is None if there is nothing to report.
-
-        Args:
-            readings: The readings.
-            usable: Whether each muscle is used, (M,).
-            now: Time of the message on a steady clock [s].
         """
         has_no_tension = ~np.isfinite(readings.tension) & self._robot.tension_source.is_known
         is_missing = (~np.isfinite(readings.length) | has_no_tension) & usable

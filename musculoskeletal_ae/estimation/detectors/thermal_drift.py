@@ -6,8 +6,11 @@ A changed module is a finding only if its winding is hot. A cool module that has
 in /diagnostics, and the arm is not stopped.
 """
 
-from musculoskeletal_ae.conditions import ConditionKind
+from collections.abc import Iterator
+
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
 
 #: stop the arm because of a changed module only if its winding is hotter than this [°C]; a cooler
@@ -16,10 +19,14 @@ COOL = 60.0
 
 
 class ThermalDrift(Detector):
-    """Reports modules whose thermal constants have changed and whose windings are hot."""
+    """Warns of modules whose thermal constants have changed, and reports one that is hot."""
 
-    def __init__(self, heat: Heat) -> None:
-        self._heat = heat
+    def __init__(self, robot: Robot, heat: Heat) -> None:
+        self._robot, self._heat = robot, heat
+
+    def accept(self) -> None:
+        """Accept the present thermal constants of all modules as their reference."""
+        self._heat.accept(*range(self._robot.muscle_count))
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
         """Report a module with changed thermal constants and a hot winding, or return None."""
@@ -27,3 +34,9 @@ class ThermalDrift(Detector):
             if self._heat.core[muscle] > COOL:
                 return Finding(muscle, ConditionKind.HOT_MODULE_CHANGED, f'its module {change}')
         return None
+
+    def conditions(self) -> Iterator[Condition]:
+        """Yield a condition for each module whose thermal constants have changed."""
+        for muscle, change in self._heat.changed.items():
+            name = self._robot.muscles[muscle]
+            yield ConditionKind.MODULE_CHANGED.condition(f'the module of {name} {change}', [name])

@@ -27,12 +27,16 @@ not hold the weight: a residual is used there only if the stop would have to pul
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.conditions import Condition, ConditionKind
+from musculoskeletal_ae.estimation.contact import Contact
+from musculoskeletal_ae.estimation.finding import Detector, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -93,10 +97,10 @@ def directions(down: Array) -> Array:
     return np.vstack([down / np.linalg.norm(down), np.transpose(sphere)])
 
 
-class MountingCheck:
-    """Compares the direction of gravity with the one that `robot.urdf` states.
+class MountingCheck(Detector):
+    """Warns if gravity acts in another direction than `robot.urdf` states.
 
-    `use` must be called before `step`.
+    `use` must be called before `step_healthy`.
 
     Attributes:
         tilt: The direction of gravity, if it certainly differs from the one of `robot.urdf`; else
@@ -114,37 +118,35 @@ class MountingCheck:
         self._angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         moving = sum(float(inertia.mass) for inertia in self._model.inertias[1:])
         self._payloads = moving * np.array(PAYLOADS)
-        self.reset()
+        self.accept()
 
     def use(self, mae: Mae) -> None:
         """Use another network; nothing is checked if its anomaly detector is not calibrated."""
         self._mae = mae
 
-    def reset(self) -> None:
-        """Reset the check: discard all evidence, for example after a reset by the user."""
+    def accept(self) -> None:
+        """Accept the present mounting, because a user says so: discard all evidence."""
         self.tilt: Tilt | None = None
         self._counted_at = np.full(self._robot.joint_count, np.inf)  # last posture that was used
         self._since = SPACING  # time since the last posture that was used [s]
         #: terms of S for each posture, newest first, (noise levels, payloads, directions)
         self._costs: deque[Array] = deque(maxlen=MEMORY)
 
-    def step(self, theta: Array, tension: Array, torque: Array, dt: float) -> None:
-        """Update the evidence with one message.
-
-        Args:
-            theta: Joint angles θ [rad], (D,).
-            tension: Bone-side tensions [N], (M,).
-            torque: External torque τ_ext [N·m], (D,); 0 where a stop may be the only cause.
-            dt: Time since the previous message [s].
-        """
-        self._since += dt
+    def step_healthy(self, observation: Observation, load: Contact | None) -> None:
+        """Update the evidence with one message, unless the tensions are unknown."""
+        if load is None:
+            return
+        theta, torque = observation.estimate.state.theta, load.torque
+        self._since += observation.dt
         moved = np.abs(theta - self._counted_at)
         has_moved = self._since >= SPACING - 1e-9 and moved.max() > MOVED
         if not self._mae.is_calibrated or not has_moved or not np.isfinite(torque).all():
             return
         self._counted_at, self._since = theta, 0.0
-        load = tension @ np.abs(self._mae.muscle_jacobian(theta, tension))
-        noise = np.maximum(load, LEAST_NOISE)
+        tension = observation.sample.bone_tension.copy()
+        tension[list(self._mae.isolated)] = 0.0
+        pull = tension @ np.abs(self._mae.muscle_jacobian(theta, tension))
+        noise = np.maximum(pull, LEAST_NOISE)
         of_arm, of_hand = self._regressors(theta)
         weight = of_arm @ self._gravity - torque  # torque that the muscles hold
         u = self._strength * self._directions.T
@@ -159,6 +161,11 @@ class MountingCheck:
         self._costs.appendleft(cost)
         if len(self._costs) >= ENOUGH:
             self._judge()
+
+    def conditions(self) -> Iterator[Condition]:
+        """Yield the condition that gravity certainly acts in another direction."""
+        if self.tilt is not None:
+            yield ConditionKind.OTHER_MOUNTING.condition(self.tilt.text)
 
     @staticmethod
     def _cost(residual: Array) -> Array:

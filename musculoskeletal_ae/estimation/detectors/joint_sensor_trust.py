@@ -45,7 +45,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.finding import Observation
+from musculoskeletal_ae.conditions import Condition, ConditionKind
+from musculoskeletal_ae.estimation.contact import Contact
+from musculoskeletal_ae.estimation.finding import Detector, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_trust_message import NOT_USED, JointTrust, SensorTrust
@@ -103,7 +105,7 @@ class _Usual(NamedTuple):
     residual_spread: Array  # spread of these length errors [m], (M,)
 
 
-class JointSensorTrust:
+class JointSensorTrust(Detector):
     """Decides which joint sensors of one arm are trusted, by comparing them with muscle lengths.
 
     Attributes:
@@ -112,7 +114,7 @@ class JointSensorTrust:
 
     def __init__(self, robot: Robot) -> None:
         """Start without a network."""
-        self._has_tensions = robot.tension_source.is_known
+        self._robot = robot
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
         #: messages in order of time; the last NEWEST messages are judged by those before
@@ -189,17 +191,10 @@ class JointSensorTrust:
 
     # -- messages -------------------------------------------------------------------------------
 
-    def step(self, observation: Observation, theta: Array, now: float, load: float = 0.0) -> None:
-        """Judge the sensors by a message of an arm without an anomaly and with known offsets.
-
-        Args:
-            observation: The message.
-            theta: Usable readings of the joint sensors [rad], (D,), NaN for other joints.
-            now: Time on a steady clock [s].
-            load: Evidence d for an external load; the message is skipped if it exceeds LOADED. NaN
-                if unknown.
-        """
-        if load > LOADED:
+    def step_healthy(self, observation: Observation, load: Contact | None) -> None:
+        """Judge the sensors by a message, unless the evidence for a load exceeds LOADED."""
+        theta = observation.joints
+        if theta is None or (load is not None and load.distance > LOADED):
             return
         self._since += observation.dt
         estimate, sample = observation.estimate.state.theta, observation.sample
@@ -215,7 +210,8 @@ class JointSensorTrust:
         length = np.where(sample.usable, sample.length, np.nan)
         tension = np.nan_to_num(sample.bone_tension)
         deviation = theta - estimate
-        self._messages.append(_CountedMessage(now, theta.copy(), tension, length, deviation))
+        message = _CountedMessage(observation.now, theta.copy(), tension, length, deviation)
+        self._messages.append(message)
         self._compared.append((deviation.copy(), length - self._mae.lengths(estimate, tension)))
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
@@ -224,6 +220,17 @@ class JointSensorTrust:
             unused = ~self.trust.is_used
             self._messages[-1 - NEWEST].theta[unused] = np.nan
             self._compared[-1 - NEWEST][0][unused] = np.nan
+
+    def conditions(self) -> Iterator[Condition]:
+        """Yield the condition that sensors are in doubt, with the deviation of each of them."""
+        trust, robot = self.trust, self._robot
+        if trust.doubted:
+            detail = ', '.join(
+                f'{robot.joints[j]} by {robot.units[j].position_text(trust.deviation[j], "+.2f")}'
+                for j in trust.doubted
+            )
+            names = [robot.joints[j] for j in trust.doubted]
+            yield ConditionKind.JOINT_SENSORS_DOUBTED.condition(detail, names)
 
     def _judge(self) -> None:
         usual = self._usual
@@ -273,7 +280,8 @@ class JointSensorTrust:
         A network that has learned little makes large errors in new postures. Without tensions, a
         load changes the estimates as false joint sensors would.
         """
-        return self._mae is not None and self._mae.is_calibrated and self._has_tensions
+        has_tensions = self._robot.tension_source.is_known
+        return self._mae is not None and self._mae.is_calibrated and has_tensions
 
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
         """Yield the limits of each joint's deviation in each window.

@@ -27,7 +27,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.finding import Finding, Observation, jump_finding
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation, jump_finding
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
@@ -76,7 +76,7 @@ EXPLAINED = frozenset(
 EXPLAINED_BY_SILENCE = EXPLAINED | {ConditionKind.LENGTH_JUMP}
 
 
-class ExchangeCheck:
+class ExchangeCheck(Detector):
     """Checks whether a fault of the driver explains a finding, and then reports that fault instead.
 
     The fault is a wrong order of the muscles, a wrong sign of a length, or lost length offsets.
@@ -102,13 +102,8 @@ class ExchangeCheck:
         """Forget the messages, because the length offsets have changed."""
         self._messages.clear()
 
-    def read(self, readings: MuscleReadings, now: float) -> None:
-        """Read the raw lengths of a message, accepted or not, to notice a pause of the driver.
-
-        Args:
-            readings: The raw readings.
-            now: Time of the message on a steady clock [s].
-        """
+    def read(self, readings: MuscleReadings, usable: Bools, now: float) -> None:  # noqa: ARG002
+        """Read the lengths of a message, accepted or not, to notice a pause of the driver."""
         length = readings.length
         if not np.isfinite(length).all():
             return
@@ -116,8 +111,8 @@ class ExchangeCheck:
             self._silence = now, self._newest[1], length
         self._newest = now, length
 
-    def note(self, observation: Observation) -> None:
-        """Note a message, at most one in 0.25 s, while the length offsets are known."""
+    def step(self, observation: Observation) -> None:
+        """Store a message, at most one in 0.25 s, while the length offsets are known."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9:
             return
