@@ -2,39 +2,14 @@
 """Finds faults of the joint sensors of a recording, for `train` and `replay --check`."""
 
 from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.problems import read_problems
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.joint_sensors import (
-    DEGREES,
-    ORDER,
-    SIGN,
-    STUCK,
-    judge,
-    stuck_sensors,
-)
+from musculoskeletal_ae.signals.joint_sensors import judge, stuck_sensors
 
 #: compare joint angles and lengths only within parts of a recording of this duration [s], because
 #: lengths may drift from one part to the next
 SEGMENT = 30.0
-#: text for users by kind of fault: what was observed, and what to do
-TEXTS = {
-    SIGN: (
-        'the lengths fit only if the sign of these joint sensors is reversed: {names}. '
-        'Publish θ with the sign that the axis in robot.urdf defines, and record again'
-    ),
-    ORDER: (
-        'the lengths fit only if these joint sensors are swapped with each other: {names}. '
-        'Publish each position under the name of its joint, and record again'
-    ),
-    DEGREES: (
-        'the readings of these joint sensors look like degrees: {names}. '
-        'Publish joint_states in rad, and record again'
-    ),
-    STUCK: (
-        'joint sensor {names} repeats one reading from {begin:.1f} s to {end:.1f} s, where the '
-        'lengths show another angle. Check the sensor, and record again, or leave the joint out '
-        'of joint_states'
-    ),
-}
+PROBLEMS = read_problems(__file__, 'joint_sensor_problems.yaml')
 
 
 def wrong_joint_sensors(robot: Robot, recording: Pairs, at_rest: bool = False) -> list[str]:
@@ -61,5 +36,6 @@ def wrong_joint_sensors(robot: Robot, recording: Pairs, at_rest: bool = False) -
     warnings = []
     for fault in faults:
         names = ', '.join(robot.joints[j] for j in fault.joints)
-        warnings.append(TEXTS[fault.kind].format(names=names, begin=fault.begin, end=fault.end))
+        problem = PROBLEMS[fault.kind].filled(names=names, begin=fault.begin, end=fault.end)
+        warnings.append(f'{problem.text}. {problem.remedy}')
     return warnings

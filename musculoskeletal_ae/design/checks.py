@@ -34,14 +34,14 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.design.equilibria import Equilibria, equilibria, is_suspended
 from musculoskeletal_ae.design.route_jumps import jumping_muscles, limit_without_jumps
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.files import read_csv, read_table
+from musculoskeletal_ae.files import read_csv
+from musculoskeletal_ae.problems import Problem, read_problems
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown, written
 from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
-from musculoskeletal_ae.schema import Strict
 
 #: report a fault if the muscles hold the arm in less than this share of the postures, or if it is
 #: stiff enough in less than this share
@@ -82,28 +82,7 @@ WIDEST_RANGES = 4.0 * np.pi, 10.0
 #: file of a robot directory in which a user declares signs of moment arms
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']  # require these columns in this file
-
-
-class FindingTexts(Strict, frozen=True, array_like=True):
-    """Message and remedy for one kind of fault or warning, with placeholders (findings.yaml)."""
-
-    message: str
-    remedy: str
-
-
-#: texts by kind of fault or warning; a part of the key after a comma names a variant of the kind
-FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
-
-
-class CheckFinding(NamedTuple):
-    """A fault or warning about a robot, with its remedy."""
-
-    kind: str  # an identifier, such as 'wrong_sign'
-    message: str  # text that names the muscles and joints
-    #: text; '' for 'not_held' and 'not_stiff', for which `holding_remedies` computes it
-    remedy: str = ''
-    #: for 'not_held' and 'not_stiff': index of the joint that is most often the weakest, or -1
-    joint: int = -1
+PROBLEMS = read_problems(__file__, 'robot_problems.yaml')
 
 
 class Setting(NamedTuple):
@@ -153,8 +132,8 @@ class RobotCheck:
     required: float  # smallest eigenvalue of the joint stiffness that is required [N·m/rad]
     matters: Array  # smallest moment arm with which a muscle acts on each joint [m], (D,)
     softest: Ints  # index of the softest joint in each posture that is held but not stiff
-    faults: tuple[CheckFinding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
-    warnings: tuple[CheckFinding, ...] = ()  # questionable properties that do not make it unsound
+    faults: tuple[Problem, ...] = ()  # reasons why the arm is not sound; empty if it is sound
+    warnings: tuple[Problem, ...] = ()  # questionable properties that do not make it unsound
 
     @property
     def held(self) -> Bools:
@@ -293,10 +272,10 @@ def _judge_suspended(setting: Setting, found: Equilibria) -> RobotCheck:
         *_useless_muscles(robot, arms, result.matters),
     ]
     if held.mean() < REQUIRED_SHARE:
-        faults.append(_finding('no_equilibrium', share=100 * held.mean(), **fields))
+        faults.append(PROBLEMS['no_equilibrium'].filled(share=100 * held.mean(), **fields))
     elif stable.mean() < REQUIRED_SHARE:
-        faults.append(_finding('unstable', share=100 * stable.mean(), **fields))
-    warnings = _finding('suspended', **fields), *_flipping_muscles(robot, arms)
+        faults.append(PROBLEMS['unstable'].filled(share=100 * stable.mean(), **fields))
+    warnings = PROBLEMS['suspended'].filled(**fields), *_flipping_muscles(robot, arms)
     return replace(result, faults=tuple(faults), warnings=warnings)
 
 
@@ -392,17 +371,7 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     return actions
 
 
-def _finding(key: str, **fields: object) -> CheckFinding:
-    """Return a fault or warning with the texts that findings.yaml has under a key.
-
-    `fields` are the values of the placeholders in these texts.
-    """
-    texts = FINDINGS[key]
-    kind = key.partition(',')[0]
-    return CheckFinding(kind, texts.message.format(**fields), texts.remedy.format(**fields))
-
-
-def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
+def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Problem]:
     """Yield a fault for each moment arm whose declared sign is wrong in too many postures."""
     for (muscle, joint), sign in read_declared_actions(robot.description).items():
         arm, terms = moment_arms[:, muscle, joint], arm_terms(robot, joint)
@@ -411,8 +380,8 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
         if not arm.any():
             actual = '0 (it does not cross the joint)'
         if against > TOLERATED_SHARE:
-            yield _finding(
-                'wrong_sign', muscle=robot.muscles[muscle], joint=robot.joints[joint], terms=terms,
+            yield PROBLEMS['wrong_sign'].filled(
+                muscle=robot.muscles[muscle], joint=robot.joints[joint], terms=terms,
                 expected=expected, actual=actual, against=100 * against,
                 median=terms.scale * np.median(arm), file=DECLARATION_FILE,
             )  # fmt: skip
@@ -420,7 +389,7 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
 
 def _one_way_joints(
     robot: Robot, moment_arms: Array, matters: Array, *, is_suspended: bool = False
-) -> Iterator[CheckFinding]:
+) -> Iterator[Problem]:
     """Yield a fault for each joint that lacks necessary muscles in too many postures.
 
     A joint needs muscles on both sides, or on one side if it has a spring or a passive tendon. The
@@ -450,17 +419,19 @@ def _one_way_joints(
             for m in np.flatnonzero(longest[:, joint] > matters[joint])
         )
         key = 'one_way_joint' if acting else 'one_way_joint, idle'
-        yield _finding(key, joint=robot.joints[joint], missing=missing, acting=acting, terms=terms)
+        yield PROBLEMS[key].filled(
+            joint=robot.joints[joint], missing=missing, acting=acting, terms=terms
+        )
 
 
-def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[CheckFinding]:
+def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Problem]:
     """Yield a fault for each muscle that acts on no joint: all its moment arms are too short."""
     along = ', or parallel to that of a prismatic joint' * bool(robot.units.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arms < matters).all():
             terms, least = arm_terms(robot, int(arms.argmax())), 1e3 * matters.max()
             fields = {'arm': terms.scale * arms.max(), 'least': least, 'along': along}
-            yield _finding('useless_muscle', muscle=muscle, terms=terms, **fields)
+            yield PROBLEMS['useless_muscle'].filled(muscle=muscle, terms=terms, **fields)
 
 
 def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
@@ -479,50 +450,52 @@ def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
     return main, against.mean(axis=0)
 
 
-def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
+def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Problem]:
     """Yield a warning for each muscle whose main action changes its sign within joint limits."""
     for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
         if against > TOLERATED_SHARE:
             names = {'muscle': robot.muscles[m], 'joint': robot.joints[joint]}
             terms = arm_terms(robot, joint)
-            yield _finding('flipping_muscle', **names, against=100 * against, terms=terms)
+            yield PROBLEMS['flipping_muscle'].filled(**names, against=100 * against, terms=terms)
 
 
-def _millimetres(moment_arms: Array) -> Iterator[CheckFinding]:
+def _millimetres(moment_arms: Array) -> Iterator[Problem]:
     """Yield a fault if most route points seem to be in millimetres instead of metres.
 
     All other faults would then be consequences of this one.
     """
     typical = float(np.median(np.abs(moment_arms).max(axis=(0, 2))))
     if typical > MILLIMETRES:
-        yield _finding('other_units, points', arm=typical)
+        yield PROBLEMS['other_units, points'].filled(arm=typical)
 
 
-def _other_units(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
+def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Problem]:
     """Yield a warning for each moment arm or joint limit that looks like millimetres or degrees."""
     longest, units = np.abs(moment_arms).max(axis=0), robot.units
     slides, ends = units.slides, (units.to_position(robot.lower), units.to_position(robot.upper))
     for m, j in np.argwhere((longest > LONGEST_ARM) & ~slides).tolist():
         names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
-        yield _finding('other_units, arm', **names, arm=longest[m, j])
+        yield PROBLEMS['other_units, arm'].filled(**names, arm=longest[m, j])
     for j, (low, high) in enumerate(zip(*ends)):
         if high - low > WIDEST_RANGES[int(slides[j])]:
             wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
             limits = {'low': low, 'high': high, 'unit': units[j].position}
-            yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
+            yield PROBLEMS['other_units, limits'].filled(
+                joint=robot.joints[j], wrong=wrong, **limits
+            )
 
 
-def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
+def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Problem]:
     """Yield a warning about the joints at which all moment arms are shorter than 15 mm."""
     # Skip joints without muscles, which are reported as one-way joints.
     longest = np.abs(moment_arms).max(axis=(0, 1))
     small = np.flatnonzero((longest > LEAST_COUNTED_ARM) & (longest < SHORT_ARM)).tolist()
     if small:
         each = ', '.join(f'{robot.joints[j]} ({1e3 * longest[j]:.1f} mm)' for j in small)
-        yield _finding('small_joints', joints=each)
+        yield PROBLEMS['small_joints'].filled(joints=each)
 
 
-def _jumping_muscles(robot: Robot) -> Iterator[CheckFinding]:
+def _jumping_muscles(robot: Robot) -> Iterator[Problem]:
     """Yield a warning for each muscle whose length jumps where its tendon slips over an object."""
     for jump in jumping_muscles(robot):
         low, high = jump.theta.min(axis=0), jump.theta.max(axis=0)
@@ -531,13 +504,13 @@ def _jumping_muscles(robot: Robot) -> Iterator[CheckFinding]:
             for j in np.flatnonzero(robot.routes.crossed[jump.muscle])
         )
         limit = limit_without_jumps(robot, jump)
-        yield _finding(
-            'jumping_muscle', muscle=robot.muscles[jump.muscle], size=1e3 * jump.size, place=place,
+        yield PROBLEMS['jumping_muscle'].filled(
+            muscle=robot.muscles[jump.muscle], size=1e3 * jump.size, place=place,
             limit=f'limit {limit}, or ' if limit else '',
         )  # fmt: skip
 
 
-def _idle_objects(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
+def _idle_objects(robot: Robot, theta: Array) -> Iterator[Problem]:
     """Yield a warning about wrapped objects that the tendon touches in none of the postures."""
     described = [
         f'{muscle} ({written(item)["wrap"]} of {round(1e3 * item.radius, 1):g} mm on {item.link})'
@@ -547,10 +520,10 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
     ]
     touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > LEAST_DETOUR
     if idle := [text for text, touches in zip(described, touched, strict=True) if not touches]:
-        yield _finding('idle_object', objects=', '.join(idle))
+        yield PROBLEMS['idle_object'].filled(objects=', '.join(idle))
 
 
-def _inertia_faults(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
+def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Problem]:
     """Yield a fault for each joint that moves almost no mass."""
     kin = robot.kinematics
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
@@ -558,10 +531,10 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
         moved = f'inertia {least[j]:.2g} kg·m²'
         if robot.units.slides[j]:
             moved = f'{least[j] / robot.units[j].radian ** 2:.2g} kg'
-        yield _finding('no_inertia', joint=robot.joints[j], moved=moved)
+        yield PROBLEMS['no_inertia'].filled(joint=robot.joints[j], moved=moved)
 
 
-def _holding_faults(check: RobotCheck) -> Iterator[CheckFinding]:
+def _holding_faults(check: RobotCheck) -> Iterator[Problem]:
     """Yield a fault if the arm is held in too few postures, and one if it is stiff in too few."""
     robot, stiffness, least = check.setting.robot, check.stiffness, check.required
     held, stiff = check.held, check.stiff
@@ -577,11 +550,11 @@ def _holding_faults(check: RobotCheck) -> Iterator[CheckFinding]:
             for k, count in counts
         )
         worst = counts[0][0]
-        yield _finding(
-            'not_held', held=100 * held.mean(), bias=shown(robot.tension.bias),
+        yield PROBLEMS['not_held'].filled(
+            robot.joints[worst], held=100 * held.mean(), bias=shown(robot.tension.bias),
             limit=shown(robot.tension.limit), required=required, others=len(lack),
             force='torque' + ' or force' * bool(robot.units.slides.any()), where=where,
-        )._replace(joint=worst)  # fmt: skip
+        )  # fmt: skip
     if stiff.mean() < REQUIRED_SHARE:
         counts = Counter(sorted(check.softest.tolist())).most_common()
         where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts) or 'none'
@@ -592,7 +565,8 @@ def _holding_faults(check: RobotCheck) -> Iterator[CheckFinding]:
                 f'unstable in {100 * unstable.mean():.1f} % of postures, with a stiffness '
                 f'eigenvalue down to {lowest} N·m/rad, and not stiff'
             )
-        yield _finding(
-            'not_stiff', problem=problem, stiff=100 * stiff.mean(),
-            least=required_stiffness(robot, least), required=required, where=where,
-        )._replace(joint=counts[0][0] if counts else worst)  # fmt: skip
+        yield PROBLEMS['not_stiff'].filled(
+            robot.joints[counts[0][0] if counts else worst], problem=problem,
+            stiff=100 * stiff.mean(), least=required_stiffness(robot, least), required=required,
+            where=where,
+        )  # fmt: skip

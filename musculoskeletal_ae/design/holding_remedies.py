@@ -20,13 +20,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design import checks
-from musculoskeletal_ae.design.checks import (
-    REQUIRED_SHARE,
-    CheckFinding,
-    RobotCheck,
-    Setting,
-    measure,
-)
+from musculoskeletal_ae.design.checks import REQUIRED_SHARE, RobotCheck, Setting, measure
+from musculoskeletal_ae.problems import Problem
 from musculoskeletal_ae.robot.description import shown
 
 #: suggest a change only if it raises the share of held or stiff postures by at least this
@@ -46,7 +41,7 @@ CHANGES = {
 }
 
 
-def remedies(check: RobotCheck, fault: CheckFinding) -> list[str]:
+def remedies(check: RobotCheck, fault: Problem) -> list[str]:
     """Return texts on remedies for an arm that is not held or not stiff in enough postures.
 
     Each text states the share of postures that are held or stiff with the remedy.
@@ -56,6 +51,7 @@ def remedies(check: RobotCheck, fault: CheckFinding) -> list[str]:
         fault: The fault of this check to remedy, of the kind 'not_held' or 'not_stiff'.
     """
     kind = fault.kind.removeprefix('not_')
+    (weakest,) = map(check.setting.robot.joints.index, fault.subjects)
 
     @cache
     def attempt(*steps: int) -> tuple[float, str]:
@@ -72,7 +68,7 @@ def remedies(check: RobotCheck, fault: CheckFinding) -> list[str]:
         setting, texts = check.setting, list[str]()
         for (what, factors), step in zip(CHANGES.items(), steps, strict=True):
             if step:
-                setting, text = changed(setting, what, factors[step - 1], fault.joint)
+                setting, text = changed(setting, what, factors[step - 1], weakest)
                 texts.insert(0, text)
         share = float(getattr(measure(setting), kind).mean())
         return share, f'{", ".join(texts)} → {100 * share:.3g} % {kind}'

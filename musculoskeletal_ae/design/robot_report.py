@@ -36,9 +36,9 @@ def check(args: Namespace) -> int:
     for text in robot.description.warnings:
         print(f'warning: {text}')
     for warning in result.warnings:
-        print(f'warning: {warning.message}; {warning.remedy}')
+        print(f'warning: {warning.text}; {warning.remedy}')
     for fault in result.faults:
-        print(f'fault: {fault.message}')
+        print(f'fault: {fault.text}')
         for remedy in [fault.remedy] if fault.remedy else remedies(result, fault):
             print(f'    remedy: {remedy}')
     count = len(result.faults)

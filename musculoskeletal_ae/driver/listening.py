@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.pace import Pace
-from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.driver.verdict import PROBLEMS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
@@ -194,7 +194,7 @@ class Listening:
                 verdict.notes.append(detail)
             else:
                 what = f'{topic}: {reason}'
-                verdict.failed(what if what in FAULTS else f'{topic}: refused', detail=detail)
+                verdict.failed(what if what in PROBLEMS else f'{topic}: refused', detail=detail)
         for name, count in self._not_finite.items():
             verdict.failed('joint not finite', name=name, count=count)
         if not self.count:
@@ -407,8 +407,10 @@ class Listening:
             each for each in sensors.faults if has_moved or each.kind == joint_sensors.DEGREES
         ]
         # Without zeros, lengths of wrong sign look like angles of wrong sign.
-        are_turned = not self._zeroed and any(each.name == 'all signs' for each in lengths.faults)
-        is_suspect = sum(len(fault.muscles) for fault in lengths.faults) > 1
+        are_turned = not self._zeroed and any(each.kind == 'all signs' for each in lengths.faults)
+        # The fault of a single length has another cause than the joint sensors.
+        wrong = {name for fault in lengths.faults for name in fault.subjects}
+        is_suspect = len(wrong) > 1 or not wrong.issubset(self._robot.muscles)
         if faults and is_suspect and not are_turned:
             others = Verdict(self._robot)
             meant = joint_sensors.corrected(theta, faults, self._robot.units)
@@ -436,8 +438,8 @@ class Listening:
         # On a symmetric arm, the reversed sign of one joint sensor looks like several exchanged
         # muscles. One fault is more likely than several.
         look_exchanged = len(lengths.faults) > 2
-        look_exchanged &= all(fault.name == 'place' for fault in lengths.faults)
-        muscles = ', '.join(robot.muscles[m] for each in lengths.faults for m in each.muscles)
+        look_exchanged &= all(fault.kind == 'place' for fault in lengths.faults)
+        muscles = ', '.join(name for each in lengths.faults for name in each.subjects)
         for fault in faults:
             names = ', '.join(robot.joints[j] for j in fault.joints)
             if fault.kind == joint_sensors.SIGN and look_exchanged:

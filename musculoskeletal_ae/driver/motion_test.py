@@ -16,7 +16,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.driver.order import EXCHANGE_BETTER, judge_order, wrong_side
-from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.driver.verdict import PROBLEMS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
@@ -168,7 +168,8 @@ class MotionTest(ABC):
             for m in self._muscles:
                 self._tested = m
                 yield from self._try(m)
-                self._is_verified[m] = all(m not in fault.muscles for fault in self.verdict.faults)
+                faults = self.verdict.faults
+                self._is_verified[m] = all(self.trying not in fault.subjects for fault in faults)
             self._judge_joints()
         except WrongOrderError as error:
             self._report_order(error.winds)
@@ -297,7 +298,7 @@ class MotionTest(ABC):
             return
         values = {'late': 1e3 * latency, 'most': 1e3 * LATEST}
         if is_overloaded():
-            name, text = self._robot.muscles[m], FAULTS['late'].observation.format(**values)
+            name, text = self._robot.muscles[m], PROBLEMS['late'].filled(**values).text
             self.verdict.excuse('latency', f'{name}: {text}')
         else:
             self.verdict.failed('late', m, **values)

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The checks of a driver, the faults that they can find, and the verdict."""
+"""The checks of a driver, the problems that they can find, and the verdict."""
 
-from collections.abc import Sequence
-from itertools import chain
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Collection, Sequence
+from itertools import chain, compress
+from typing import Literal, get_args
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
-from musculoskeletal_ae.files import read_table
+from musculoskeletal_ae.problems import Problem, read_problems
 from musculoskeletal_ae.report import load_text
 from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.schema import Strict
 
 #: checks of each muscle: messages and their rate, order of rows and columns, units, sign and zero
 #: of l, the MSC law, its clip at tension.max, and latency
@@ -31,32 +30,9 @@ def _change_text(change: str) -> str:
     return '\n            '.join(f'{n}. {step}' for n, step in enumerate(steps, 1))
 
 
-class FaultTexts(Strict, frozen=True, array_like=True):
-    """Texts about one fault: an entry of faults.yaml."""
-
-    check: Check
-    observation: str
-    change: str
-    subject: Literal['muscles', 'joint angles'] = 'muscles'
-
-
-#: texts by name of the fault; names of faults that reject messages begin with the topic
-FAULTS = read_table(__file__, 'faults.yaml', dict[str, FaultTexts])
-
-
-class Fault(NamedTuple):
-    """A fault that a check has found in the driver."""
-
-    check: str
-    muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver
-    observation: str
-    change: str  # what to change in the driver
-    name: str  # name of the fault in FAULTS
-
-    @property
-    def is_of_joints(self) -> bool:
-        """Whether the joint angles have the fault, so that no muscle could be judged."""
-        return FAULTS[self.name].subject == 'joint angles'
+#: problems by kind; kinds that reject messages begin with the topic. A row that states a subject is
+#: about the joint angles, so that no muscle can be judged.
+PROBLEMS = read_problems(__file__, 'driver_problems.yaml')
 
 
 class Verdict:
@@ -65,7 +41,7 @@ class Verdict:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self._state = np.full((robot.muscle_count, len(CHECKS)), OPEN, dtype=object)
-        self.faults: list[Fault] = []
+        self.faults: list[Problem] = []
         self.notes: list[str] = []  # remarks, and checks that were not possible
         #: checks that were not possible for all muscles, and how to make them possible
         self._remedies: list[tuple[tuple[Check, ...], str]] = []
@@ -89,21 +65,19 @@ class Verdict:
         """Record a fault.
 
         Args:
-            what: Name of the fault in FAULTS.
+            what: Kind of the fault in PROBLEMS.
             muscles: Indices of the affected muscles. Without any, all muscles are affected.
             values: Values for the placeholders in the fault's texts.
         """
-        texts = FAULTS[what]
+        problem = PROBLEMS[what]
         if muscles:
             first, robot = muscles[0], self.robot
             law = LAW.format(robot.tension.bias[first], robot.stiffness[first])
             values['law'] = robot.actuation.choose(law, POSITION_LAW)
         muscles = muscles or tuple(range(self.robot.muscle_count))
-        observation, change = (text.format(**values) for text in (texts.observation, texts.change))
-        fault = Fault(texts.check, muscles, observation, change, what)
-        self.faults.append(fault)
-        if not fault.is_of_joints:
-            self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
+        self.faults.append(problem.filled(*(self.robot.muscles[m] for m in muscles), **values))
+        if not problem.subjects:
+            self._state[list(muscles), CHECKS.index(problem.check)] = WRONG
 
     def excuse(self, check: Check, observation: str) -> None:
         """Record that a check is not judged, because this computer is overloaded.
@@ -176,17 +150,13 @@ class Verdict:
             if excluded is not None:
                 is_open &= ~excluded
             if is_open.any():
-                names.setdefault(self._whose(np.flatnonzero(is_open).tolist()), []).append(check)
+                whose = self._whose([*compress(self.robot.muscles, is_open)])
+                names.setdefault(whose, []).append(check)
         return '; '.join(f'{", ".join(checks)} of {whose}' for whose, checks in names.items())
 
-    def _whose(self, muscles: Sequence[int]) -> str:
-        """Return the names of muscles, separated by commas, or 'all muscles' for all of them."""
-        if len(muscles) == self.robot.muscle_count:
-            return 'all muscles'
-        return ', '.join(self.robot.muscles[m] for m in muscles)
-
-    def _subject(self, fault: Fault) -> str:
-        return 'the joint angles' if fault.is_of_joints else self._whose(fault.muscles)
+    def _whose(self, subjects: Collection[str]) -> str:
+        """Return the names of subjects, separated by commas, or 'all muscles' for all of them."""
+        return 'all muscles' if {*subjects} == {*self.robot.muscles} else ', '.join(subjects)
 
     @property
     def table(self) -> str:
@@ -208,8 +178,8 @@ class Verdict:
                 'detect smaller errors'
             )
         remarks += [
-            f'fault: {fault.check} of {self._subject(fault)}: {fault.observation}\n'
-            f'    change: {_change_text(fault.change)}'
+            f'fault: {fault.check} of {self._whose(fault.subjects)}: {fault.text}\n'
+            f'    change: {_change_text(fault.remedy)}'
             for fault in self.faults
         ]
         if self._excused:
@@ -224,7 +194,7 @@ class Verdict:
         # and the remedy would not help.
         columns = [CHECKS.index(check) for check in ('order', 'unit', 'sign')]
         has_fault: Bools = (self._state[:, columns] == WRONG).any(axis=1)
-        has_fault |= any(fault.is_of_joints for fault in self.faults)
+        has_fault |= any(PROBLEMS[fault.kind].subjects for fault in self.faults)
         for checks, remedy in self._remedies:
             if unjudged := self._unjudged(checks, has_fault):
                 remarks.append(f'note: {unjudged} not judged: {remedy}')

@@ -126,15 +126,15 @@ def run(args: Namespace) -> int:
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.notes:
         print(note)
-    for warning in robot.description.warnings:
-        print(f'warning: {warning}')
+    for text in robot.description.warnings:
+        print(f'warning: {text}')
     print(length_verdict(comparison))
     if comparison is not None and comparison.lengths:
         print(arm_verdict(comparison))
     check = check_robot(robot)
-    for finding in check.warnings:
-        if finding.kind == 'jumping_muscle':  # its remedies change the source or the import
-            print(f'warning: {finding.message}; {finding.remedy}')
+    for warning in check.warnings:
+        if warning.kind == 'jumping_muscle':  # its remedies change the source or the import
+            print(f'warning: {warning.text}; {warning.remedy}')
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
     print(check_verdict(check))
     return 0

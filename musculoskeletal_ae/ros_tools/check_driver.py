@@ -243,7 +243,7 @@ def _check(options: Namespace, arguments: list[str]) -> int:
     driver, reported, remarks = CheckDriver(robot, options), None, list[str]()
     while True:
         verdict = driver.listen()
-        faults = {fault[:2] for fault in verdict.faults}
+        faults = {(fault.check, fault.subjects) for fault in verdict.faults}
         if faults != reported:
             _say(verdict)
             remarks = verdict.remarks

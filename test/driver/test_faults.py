@@ -23,7 +23,7 @@ from musculoskeletal_ae.driver import listening
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion_test import ABOVE_BIAS, RUN_AWAY_TENSION
 from musculoskeletal_ae.driver.stiffness_motion_test import Winding
-from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
+from musculoskeletal_ae.driver.verdict import CHECKS, PROBLEMS, Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import message_reading
 from musculoskeletal_ae.robot.description import TensionRange
@@ -227,7 +227,8 @@ def test_one_wrong_zero_is_not_taken_for_a_wrong_order(name):
         driver = Driver(robot)
         driver.publish = partial(offset, m)
         verdict = driver.listen(0.5)
-        assert [fault.muscles for fault in verdict.faults if fault.check == 'zero'] == [(m,)]
+        zeros = [fault.subjects for fault in verdict.faults if fault.check == 'zero']
+        assert zeros == [(robot.muscles[m],)]
         assert verdict.wrong == {'zero'}, str(verdict)
         assert 'wrong sign or order looks like a wrong zero' in str(verdict)
 
@@ -242,7 +243,7 @@ def offset(m, rows):
 def test_the_first_step_against_a_wrong_zero_of_an_arm_at_rest_is_to_move_it_by_hand(moved):
     (fault,) = heard(moved, publish=shifted).faults
     assert fault.check == 'zero'
-    first, *others = fault.change.splitlines()
+    first, *others = fault.remedy.splitlines()
     assert ('without --move' in first) != moved
     assert bool(others) != moved
 
@@ -263,7 +264,7 @@ def test_the_reversed_sign_of_every_length_is_one_fault_of_an_arm_at_rest(robot)
         listening.muscles(array(rows + 1e-4 * noise.normal(size=rows.shape)), 0.01 * k)
     verdict = listening.verdict(0.5)
     assert len(verdict.faults) == 1 and 'reverse the sign of every l' in str(verdict), str(verdict)
-    assert 'judged at rest, which is not reliable' in verdict.faults[0].observation
+    assert 'judged at rest, which is not reliable' in verdict.faults[0].text
 
 
 def test_the_tolerance_of_zeros_is_stated():
@@ -362,8 +363,8 @@ def test_a_reversed_joint_sensor_of_a_symmetric_arm_is_not_taken_for_several_exc
         listening.joints(joint_state(dict(zip(neck.joints, signs * theta))))
         listening.muscles(array(rows[:, order]), 0.01 * k)
     verdict = listening.verdict(4.0)
-    assert [fault.name for fault in verdict.faults] == faults, str(verdict)
-    assert not faults or named in verdict.faults[0].observation
+    assert [fault.kind for fault in verdict.faults] == faults, str(verdict)
+    assert not faults or named in verdict.faults[0].text
     assert not verdict.allows_motion or not faults
 
 
@@ -385,9 +386,9 @@ def listened(robot, spoil):
 def test_zeros_of_a_second_publisher_are_named_and_no_length_is_blamed(neck):
     verdict = listened(neck, lambda _, theta: [theta, 0.0 * theta])
     (fault,) = verdict.faults
-    assert fault.name == 'false joint angles'
-    assert '50 % of the 800 messages' in fault.observation and 'roll 0 rad' in fault.observation
-    assert 'stop a second program' in fault.change
+    assert fault.kind == 'false joint angles'
+    assert '50 % of the 800 messages' in fault.text and 'roll 0 rad' in fault.text
+    assert 'stop a second program' in fault.remedy
 
 
 def test_a_single_false_angle_is_a_remark_with_its_value(neck):
@@ -401,8 +402,8 @@ def test_the_angle_that_is_beyond_the_limits_is_quoted(neck):
     far = neck.upper + 0.5
     verdict = listened(neck, lambda k, theta: [theta if k < 100 else far])
     (fault,) = verdict.faults
-    assert fault.name == 'joint'
-    assert f'{far[0]:.3g} rad, 0.5 rad beyond its limits' in fault.observation
+    assert fault.kind == 'joint'
+    assert f'{far[0]:.3g} rad, 0.5 rad beyond its limits' in fault.text
 
 
 def test_advice_on_a_rejected_message_is_that_of_its_topic():
@@ -413,7 +414,7 @@ def test_advice_on_a_rejected_message_is_that_of_its_topic():
     listening.joints(joint_state(dict.fromkeys(ROBOT.joints, math.nan)))
     listening.joints(joint_state({}))
     listening.muscles(array(np.zeros((2, M))), 0.0)
-    advice = [fault.change for fault in listening.verdict(0.1).faults]
+    advice = [fault.remedy for fault in listening.verdict(0.1).faults]
     assert sum('fill `name` and `position`' in change for change in advice) == 2
     assert sum('3×M' in change for change in advice) == 1  # this advice concerns muscle_states only
 
@@ -436,7 +437,7 @@ def test_every_advice_on_a_rejected_message_belongs_to_a_reason_to_reject_it():
             assert reasons
             rejected |= {f'{topic}: {reason}' for reason in reasons}
         rejected.add(f'{topic}: refused')
-    assert {fault for fault in FAULTS if ': ' in fault} <= rejected
+    assert {fault for fault in PROBLEMS if ': ' in fault} <= rejected
 
 
 def ros2_control(**wrong):
@@ -537,7 +538,7 @@ def test_only_a_complete_check_says_that_the_driver_keeps_its_contract():
 
 def test_no_remark_advises_to_move_an_arm_that_was_moved_for_muscles_in_the_wrong_order():
     verdict = heard(moved=True, publish=exchanged)
-    misplaced = {ROBOT.muscles[m] for fault in verdict.faults for m in fault.muscles}
+    misplaced = {name for fault in verdict.faults for name in fault.subjects}
     assert len(misplaced) == 2
     for remark in not_judged(verdict):
         assert 'all muscles' not in remark and not any(name in remark for name in misplaced)
@@ -575,7 +576,7 @@ def test_slow_repeated_and_frozen_messages_are_found():
         return rows
 
     verdict = heard(publish=freeze)
-    assert [fault.muscles for fault in verdict.faults] == [(3,)], str(verdict)
+    assert [fault.subjects for fault in verdict.faults] == [(ROBOT.muscles[3],)], str(verdict)
 
 
 LONGEST_TICK = 0.07  # as in check_driver [s]
@@ -808,7 +809,7 @@ def test_a_joint_sensor_of_wrong_sign_is_named_by_winding_in(joint):
     sign[joint] = -1.0
     driver.angles = lambda theta: sign * theta
     verdict = driver.wind()
-    assert {fault.name for fault in verdict.faults} == {'joint sign'}, str(verdict)
+    assert {fault.kind for fault in verdict.faults} == {'joint sign'}, str(verdict)
     assert f'sign of the angle of {ROBOT.joints[joint]} is reversed' in str(verdict)
     assert 'WRONG' not in verdict.table  # no muscle has a fault
 
@@ -1030,7 +1031,7 @@ def test_each_fault_of_a_driver_that_follows_positions_is_detected(fault):
         value = lambda rows: np.stack([rows[0], 2.0 * home[1] - rows[1], rows[2]])  # noqa: E731
     setattr(driver, where, value)
     verdict = driver.wind((BICEPS,))
-    assert what in {fault.name for fault in verdict.faults}, str(verdict)
+    assert what in {fault.kind for fault in verdict.faults}, str(verdict)
 
 
 def test_an_optional_quantity_is_judged_by_its_entry_in_the_table(monkeypatch):
@@ -1047,6 +1048,6 @@ def test_an_optional_quantity_is_judged_by_its_entry_in_the_table(monkeypatch):
     assert not heard(publish=publish).faults
     row[BICEPS] = 190.0
     (fault,) = heard(publish=publish).faults
-    assert fault.muscles == (BICEPS,)
-    assert fault.observation == 'its humidity is 190 %; possible: 0 to 100 %'
-    assert fault.change == 'publish %, or NaN if it is not measured'
+    assert fault.subjects == (ROBOT.muscles[BICEPS],)
+    assert fault.text == 'its humidity is 190 %; possible: 0 to 100 %'
+    assert fault.remedy == 'publish %, or NaN if it is not measured'

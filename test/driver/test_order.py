@@ -41,9 +41,9 @@ def misordered(robot, muscles, what, seed=0, reality='kin'):
 def assert_names(verdict, muscles, name=None):
     (fault,) = verdict.faults
     assert fault.check == 'order', str(verdict)
-    assert name in (None, fault.name), str(verdict)
-    assert set(fault.muscles) == set(muscles), str(verdict)
-    assert all(verdict.robot.muscles[m] in fault.observation for m in muscles)
+    assert name in (None, fault.kind), str(verdict)
+    assert set(fault.subjects) == {verdict.robot.muscles[m] for m in muscles}, str(verdict)
+    assert all(name in fault.text for name in fault.subjects)
 
 
 def thorough(*case):
@@ -107,15 +107,15 @@ def test_commands_are_exchanged_if_a_moving_hand_showed_that_the_readings_are_ri
     heard = driver.listen(8.0, moved=True)
     driver.listen(3.0)
     (fault,) = driver.wind(heard=heard).faults
-    assert fault.name == 'misplaced commands'
+    assert fault.kind == 'misplaced commands'
 
 
 def test_without_joint_sensors_the_report_says_how_to_find_the_exchanged_side():
     driver = misordered(ARM26, (1, 4), 'readings')
     driver.angles = lambda theta: np.full_like(theta, np.nan)
     (fault,) = driver.wind().faults
-    assert fault.name == 'misplaced'
-    assert ARM26.muscles[1] in fault.change or ARM26.muscles[4] in fault.change
+    assert fault.kind == 'misplaced'
+    assert ARM26.muscles[1] in fault.remedy or ARM26.muscles[4] in fault.remedy
 
 
 @pytest.mark.parametrize('share', [0.4, thorough(1.0)])

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each change that check_driver prints is made in the driver that has the fault.
 
-A row of a table has the name of a fault in faults.yaml, a part of its advice, a function that makes
-a driver with this fault, and the functions that follow the advice. The latter change what leaves or
-reaches the faulty driver, and use no more than the printed text and what a user would look up. A
-change after which the fault, or another one, is found fails its test.
+A row of a table has the kind of a fault in driver_problems.yaml, a part of its advice, a function
+that makes a driver with this fault, and the functions that follow the advice. The latter change
+what leaves or reaches the faulty driver, and use no more than the printed text and what a user
+would look up. A change after which the fault, or another one, is found fails its test.
 """
 
 import copy
@@ -46,7 +46,7 @@ from driver.test_order import CYCLE, misordered
 from musculoskeletal_ae.driver.listening import TENSION_UNITS, UNITS, Listening
 from musculoskeletal_ae.driver.position_motion_test import Positioning
 from musculoskeletal_ae.driver.stiffness_motion_test import Winding
-from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.driver.verdict import PROBLEMS, Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
@@ -102,6 +102,11 @@ def muscles_in(text):
     """Return the indices of the muscles that a text names, in the order of the text."""
     places = {m: text.find(name) for m, name in enumerate(ROBOT.muscles)}
     return sorted((m for m in places if places[m] >= 0), key=places.get)
+
+
+def muscles_of(fault):
+    """Return the indices of the muscles that a fault concerns."""
+    return [ROBOT.muscles.index(name) for name in fault.subjects]
 
 
 def joints_in(text):
@@ -313,7 +318,7 @@ MESSAGES = {
 
 def fault_of(message):
     """Return the name of the fault that a message causes."""
-    return message if message in FAULTS else f'{message.partition(": ")[0]}: refused'
+    return message if message in PROBLEMS else f'{message.partition(": ")[0]}: refused'
 
 
 @pytest.mark.parametrize('name', MESSAGES)
@@ -326,8 +331,8 @@ def test_a_message_is_accepted_after_the_change(name):
         return judged(message, angles(), connected() if topic == 'motors' else None)
 
     (fault, *_) = verdict(wrong).faults
-    assert fault.name == fault_of(name) and advice in fault.change
-    assert name.partition(': ')[2] in fault.observation  # the reason
+    assert fault.kind == fault_of(name) and advice in fault.remedy
+    assert name.partition(': ')[2] in fault.text  # the reason
     for message in changed or [motors()]:
         assert not verdict(message).faults, str(verdict(message))
 
@@ -335,7 +340,7 @@ def test_a_message_is_accepted_after_the_change(name):
 def test_the_motors_of_a_message_are_found_after_the_correction_of_their_names():
     renamed = ('other', *MOTORS[1:])
     (fault,) = judged(of_motors(rename), angles(), connected()).faults
-    assert 'or correct `joint` in motors.yaml' in fault.change
+    assert 'or correct `joint` in motors.yaml' in fault.remedy
     assert not judged(of_motors(rename), angles(), connected(renamed)).faults
 
 
@@ -350,8 +355,8 @@ def test_readings_without_tension_are_accepted_after_the_change_of_muscles_yaml(
     message, motors, tmp_path
 ):
     (fault,) = judged(message, angles(), motors).faults
-    assert fault.name.endswith(': not finite')
-    advice = re.split('[Ww]ithout (?:effort|tension sensors)', fault.change)[1]
+    assert fault.kind.endswith(': not finite')
+    advice = re.split('[Ww]ithout (?:effort|tension sensors)', fault.remedy)[1]
     directory = copy_robot('arm26', tmp_path)
     document = read_muscles(directory) | dict(re.findall(r'(\w+): (\w+)', advice))
     for removed in re.findall(r'remove its `(\w+)`', advice):
@@ -397,7 +402,7 @@ def of_muscle(m, row, change):
 
 def to_row_order(driver, fault):
     """Publish length, tension and temperature in this order; the fault says what the rows are."""
-    names = re.search(r'rows look like (.*)', fault.observation)[1].split(', ')
+    names = re.search(r'rows look like (.*)', fault.text)[1].split(', ')
     order = [names.index(name) for name in ('length', 'tension', 'temperature')]
     then(driver, 'publish', lambda rows: rows[order])
 
@@ -410,7 +415,7 @@ def to_unit(row, unit):
     """Return a change: convert a row from the unit of the driver, which the fault names."""
 
     def change(driver, fault):
-        named = fault.observation.rpartition(' look like ')[2].split(' or ')
+        named = fault.text.rpartition(' look like ')[2].split(' or ')
         assert unit in named or unit.replace('N', 'A') in named
         units = {unit: factor for each in UNITS.values() for unit, factor in each.items()}
         factors = [1.0, 1.0, 1.0]
@@ -425,32 +430,32 @@ def to_celsius(driver, _):
 
 
 def to_positive(driver, fault):
-    for m in fault.muscles:
+    for m in muscles_of(fault):
         then(driver, 'publish', of_muscle(m, TENSION, lambda tension: -tension))
 
 
 def zero_the_tension_sensor(driver, fault):
     """Subtract what each sensor reads with the tendon detached."""
     detached = driver.publish(np.zeros((3, M)))[TENSION]
-    for m in fault.muscles:
+    for m in muscles_of(fault):
         then(driver, 'publish', of_muscle(m, TENSION, lambda read, m=m: read - detached[m]))
 
 
 def zero_the_length(driver, fault):
     """Let l of these muscles be 0 at θ = 0, where the route has the length 0 as well."""
     at_zero = driver.publish(np.zeros((3, M)))[LENGTH]
-    for m in fault.muscles:
+    for m in muscles_of(fault):
         then(driver, 'publish', of_muscle(m, LENGTH, lambda length, m=m: length - at_zero[m]))
 
 
 def reverse_lengths(driver, fault):
-    for m in fault.muscles:
+    for m in muscles_of(fault):
         then(driver, 'publish', of_muscle(m, LENGTH, lambda length: -length))
 
 
 def subtract_the_offset(driver, fault):
-    off = 1e-3 * numbers_in(fault.observation)[0]
-    for m in fault.muscles:
+    off = 1e-3 * numbers_in(fault.text)[0]
+    for m in muscles_of(fault):
         then(driver, 'publish', of_muscle(m, LENGTH, lambda length: length - off))
 
 
@@ -463,32 +468,32 @@ def publish_in_order(driver, faults):
     """Move every column to the muscle that it behaves like, as the faults say."""
     order = list(range(M))
     for fault in faults if isinstance(faults, list) else [faults]:
-        (m,), (other,) = fault.muscles, muscles_in(fault.observation)
+        (m,), (other,) = muscles_of(fault), muscles_in(fault.text)
         order[other] = m
     then(driver, 'publish', lambda rows: rows[:, order])
 
 
 def to_radians(driver, fault):
-    turned = joints_in(fault.observation)
+    turned = joints_in(fault.text)
     then(driver, 'angles', lambda theta: np.where(np.isin(range(len(theta)), turned),
                                                   np.radians(theta), theta))  # fmt: skip
 
 
 def reverse_angles(driver, fault):
     sign = np.ones(ROBOT.joint_count)
-    sign[joints_in(fault.observation)] = -1.0
+    sign[joints_in(fault.text)] = -1.0
     then(driver, 'angles', lambda theta: sign * theta)
 
 
 def exchange_angles(driver, fault):
-    one, other = joints_in(fault.observation)
+    one, other = joints_in(fault.text)
     order = list(range(ROBOT.joint_count))
     order[one], order[other] = other, one
     then(driver, 'angles', lambda theta: theta[order])
 
 
 def leave_out(driver, fault):
-    (j,) = joints_in(fault.observation)
+    (j,) = joints_in(fault.text)
     driver.names = [name for name in ROBOT.joints if name != ROBOT.joints[j]]
     then(driver, 'angles', lambda theta: np.delete(theta, j))
 
@@ -778,8 +783,8 @@ def listen(case, change=None, faults=()):
 def test_a_fault_that_listening_finds_is_gone_after_the_change(name):
     case, fault_name = HEARD[name], name.partition(', ')[0]
     before = listen(case)
-    assert {fault.name for fault in before.faults} == {fault_name}, str(before)
-    assert case.advice in before.faults[0].change
+    assert {fault.kind for fault in before.faults} == {fault_name}, str(before)
+    assert case.advice in before.faults[0].remedy
     for change in case.changes:
         faults = before.faults
         if change is publish_in_order:  # the faults describe one order together
@@ -795,10 +800,10 @@ def test_the_first_step_against_a_wrong_zero_at_rest_finds_a_wrong_sign():
     # The sensor counts in the wrong direction from a zero that is wrong as well.
     turned = publishing(of_muscle(BICEPS, LENGTH, lambda length: 2.0 * middle - length + 0.08))
     (fault,) = listen(at_rest._replace(spoil=turned)).faults
-    assert fault.name == 'zero at rest'
-    assert fault.change.startswith('run check_driver without --move, and move the arm by hand')
+    assert fault.kind == 'zero at rest'
+    assert fault.remedy.startswith('run check_driver without --move, and move the arm by hand')
     (fault,) = listen(at_rest._replace(spoil=turned, moved=True)).faults
-    assert fault.name == 'sign'
+    assert fault.kind == 'sign'
 
 
 @pytest.mark.parametrize('is_sensor', [True, False])
@@ -820,11 +825,11 @@ def test_the_steps_against_a_reversed_sensor_of_a_symmetric_arm_end_the_fault(ne
         return listening.verdict(4.0)
 
     (fault,) = verdict(signs, order).faults
-    assert fault.name == 'joint sign or order'
-    first_step, second_step = fault.change.splitlines()
+    assert fault.kind == 'joint sign or order'
+    first_step, second_step = fault.remedy.splitlines()
     assert 'with the sign that the axis in robot.urdf defines' in first_step
     if is_sensor:
-        reversed_joint = neck.joints.index(re.search('angle of (\\w+)', fault.observation)[1])
+        reversed_joint = neck.joints.index(re.search('angle of (\\w+)', fault.text)[1])
         signs = [sign * (-1.0) ** (j == reversed_joint) for j, sign in enumerate(signs)]
     else:
         named = [name for name in neck.muscles if name in second_step]
@@ -888,7 +893,7 @@ def disordered(muscles, what, robot=ROBOT, sensors=True):
 
 
 def follow_the_stated_law(driver, fault):
-    driver.in_tension = law_in(fault.change, driver.robot)
+    driver.in_tension = law_in(fault.remedy, driver.robot)
 
 
 def limit_the_tension(driver, _):
@@ -917,12 +922,12 @@ def reverse_lengths_of_the_law(driver, _):
 
 
 def count_commands_from_the_zero_of_l(driver, fault):
-    tight, length = (1e-3 * each for each in numbers_in(fault.observation))
+    tight, length = (1e-3 * each for each in numbers_in(fault.text))
     first(driver, lambda target: target + tight - length)
 
 
 def exchange_tensions(driver, fault):
-    (m,), (other,) = fault.muscles, muscles_in(fault.observation)
+    (m,), (other,) = muscles_of(fault), muscles_in(fault.text)
     order = list(range(M))
     order[m], order[other] = other, m
 
@@ -937,7 +942,7 @@ def exchange_tensions(driver, fault):
 def moves_in(fault):
     """Return for each command which column of the readings it moves, as the fault says."""
     pairs = re.findall(r'winding in (\w+)(?: moved the readings of | those of )(\w+)',
-                       fault.observation)  # fmt: skip
+                       fault.text)  # fmt: skip
     index = ROBOT.muscles.index
     return {index(one): index(other) for one, other in pairs}
 
@@ -959,7 +964,7 @@ def exchange_readings(driver, fault):
 
 
 def exchange_both(driver, fault):
-    names = re.findall(r'(\w+) moves like (\w+)', fault.observation)
+    names = re.findall(r'(\w+) moves like (\w+)', fault.text)
     order = list(range(M))
     for one, other in names:
         order[ROBOT.muscles.index(other)] = ROBOT.muscles.index(one)
@@ -976,7 +981,7 @@ def find_the_side_by_hand(driver, fault):
 
 def press_on_the_tendon(driver, fault):
     """Press on the tendon that the advice names: its own readings or those of another change."""
-    (m,) = muscles_in(re.search('press on the tendon of (.*?) while', fault.change)[1])
+    (m,) = muscles_in(re.search('press on the tendon of (.*?) while', fault.remedy)[1])
     pressed = np.zeros((3, M))
     pressed[TENSION, m] = 1.0
     own = driver.publish(pressed)[TENSION, m] == 1.0
@@ -1156,13 +1161,13 @@ WOUND = {
 def test_a_fault_that_the_motion_test_finds_is_gone_after_the_change(name):
     case, fault_name = WOUND[name], name.partition(', ')[0]
     before = case.driver().wind(case.muscles)
-    faults = {fault.name: fault for fault in before.faults}
+    faults = {fault.kind: fault for fault in before.faults}
     assert fault_name in faults, str(before)
-    assert case.advice in faults[fault_name].change
+    assert case.advice in faults[fault_name].remedy
     for change in case.changes:
         driver = case.driver()
         change(driver, faults[fault_name])
-        after = driver.wind(case.muscles or faults[fault_name].muscles)
+        after = driver.wind(case.muscles or muscles_of(faults[fault_name]))
         assert not after.faults, str(after)
 
 
@@ -1170,13 +1175,13 @@ def test_every_fault_has_a_row_or_a_reason():
     tried = {key.partition(', ')[0] for key in [*HEARD, *WOUND]} | {*map(fault_of, MESSAGES)}
     tried |= {'silent', 'joint sign or order'}  # tests of their own
     assert tried.isdisjoint(EXCEPTIONS)
-    assert tried | EXCEPTIONS.keys() == FAULTS.keys()
+    assert tried | EXCEPTIONS.keys() == PROBLEMS.keys()
 
 
 def test_a_driver_that_publishes_its_topic_is_heard():
     (fault,) = Listening(ROBOT, 100.0).verdict(3.0).faults
-    assert fault.name == 'silent' and 'muscle_states' in fault.observation
-    assert 'publish the topic' in fault.change
+    assert fault.kind == 'silent' and 'muscle_states' in fault.text
+    assert 'publish the topic' in fault.remedy
     assert not judged(SOUND, angles()).faults
 
 

@@ -63,7 +63,7 @@ def in_millimetres(document):
 
 
 def test_routes_in_millimetres_are_the_only_fault(tmp_path, capsys):
-    """Other findings would only follow from the wrong unit, and their remedies would mislead."""
+    """Other problems would only follow from the wrong unit, and their remedies would mislead."""
     directory = change(write_robot(tmp_path / 'arm'), in_millimetres)
     status, out, _ = verdict(capsys, directory)
     assert status == 1 and 'in metres, not millimetres' in out
@@ -282,7 +282,7 @@ def test_a_main_action_that_changes_sign_is_a_warning_not_a_fault(tmp_path):
 
     result = check_robot(Robot.load(change(write_robot(tmp_path), cross)))
     assert [warning.kind for warning in result.warnings] == ['flipping_muscle']
-    assert "'crosser'" in result.warnings[0].message
+    assert "'crosser'" in result.warnings[0].text
     assert '`wrap: cylinder`' in result.warnings[0].remedy
     assert result.faults == ()
 
@@ -298,7 +298,7 @@ def test_a_joint_that_moves_no_mass_is_a_fault(tmp_path):
             text = text.replace(f'{entry}="{value}"', f'{entry}="0"')
     file.write_text(text)
     (fault,) = (f for f in check_robot(Robot.load(directory)).faults if f.kind == 'no_inertia')
-    assert "'bend'" in fault.message
+    assert "'bend'" in fault.text
 
 
 FINGER = """<robot name="finger"><link name="palm"/>
@@ -449,7 +449,7 @@ def test_an_object_that_no_tendon_touches_is_reported(change, tmp_path):
         ]
         warnings = check_robot(Robot.load(write_muscles(folder, document)), 60).warnings
         assert [warning.kind for warning in warnings] == kinds
-    assert 'triceps_lateral (cylinder of' in warnings[0].message
+    assert 'triceps_lateral (cylinder of' in warnings[0].text
 
 
 def remedies_of(directory, kind, postures=30):

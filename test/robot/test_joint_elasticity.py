@@ -142,7 +142,7 @@ def test_a_spring_takes_the_place_of_an_antagonist(tmp_path):
     assert 'one_way_joint' in {fault.kind for fault in without.faults}
     document['joint_elasticity'] = [{'joint': 'bend', 'stiffness': 9.0, 'rest_angle': 0.6}]
     sprung = check_robot(Robot.load(write_muscles(tmp_path, document)))
-    assert not sprung.faults, [fault.message for fault in sprung.faults]
+    assert not sprung.faults, [fault.text for fault in sprung.faults]
     assert sprung.held.mean() > 0.95
     document['joint_elasticity'][0]['stiffness'] = 0.5
     weak = check_robot(Robot.load(write_muscles(tmp_path, document)))

@@ -30,8 +30,8 @@ def test_a_jump_of_length_is_located():
 def test_check_robot_warns_of_a_muscle_whose_length_jumps(tmp_path):
     (warning,) = check_robot(behind_a_drum(tmp_path, DRUM_ENDS['jumps'])).warnings
     assert warning.kind == 'jumping_muscle'
-    assert "'straightener' jumps by up to 173 mm" in warning.message
-    assert 'for bend from -1.57 to -1.57 rad; no network can represent this' in warning.message
+    assert "'straightener' jumps by up to 173 mm" in warning.text
+    assert 'for bend from -1.57 to -1.57 rad; no network can represent this' in warning.text
 
 
 @pytest.mark.parametrize(

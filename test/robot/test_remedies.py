@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each remedy that check_robot prints is applied to the robot directory that has the finding.
+"""Each remedy that check_robot prints is applied to the robot directory that has the problem.
 
-A row of the table has a key of findings.yaml, a part of the remedy, a function that writes a robot
-directory with this finding, and edits of the directory. Each edit follows the remedy literally, and
-afterwards check_robot has neither this finding nor a fault.
+A row of the table has a key of robot_problems.yaml, a part of the remedy, a function that writes a
+robot directory with this problem, and edits of the directory. Each edit follows the remedy
+literally, and afterwards check_robot has neither this problem nor a fault.
 """
 
 import re
@@ -24,13 +24,14 @@ from robots import (
     write_robot,
 )
 
-from musculoskeletal_ae.design.checks import FINDINGS, CheckFinding, check_robot
+from musculoskeletal_ae.design.checks import PROBLEMS, check_robot
+from musculoskeletal_ae.problems import Problem
 from musculoskeletal_ae.robot.robot import Robot
 
 from .test_check_robot import IDLE, drop_straighteners, in_millimetres
 
 POSTURES = 40
-#: findings that have no row here
+#: problems that have no row here
 EXCEPTIONS = {
     'small_joints': 'the remedy changes the expectations of the reader, not the robot',
     'suspended': 'the remedy changes the expectations of the reader, not the robot',
@@ -40,11 +41,11 @@ EXCEPTIONS = {
 
 
 class Row(NamedTuple):
-    """A finding, and the edits that its remedy allows."""
+    """A problem, and the edits that its remedy allows."""
 
-    write: Callable[[Path], object]  # writes a robot directory with the finding
+    write: Callable[[Path], object]  # writes a robot directory with the problem
     remedy: str  # a part of the remedy
-    edits: list[Callable[[Path, CheckFinding], object]]
+    edits: list[Callable[[Path, Problem], object]]
 
 
 def edited(edit):
@@ -144,9 +145,9 @@ def scaled_route(muscle, factor):
     return edited(edit)
 
 
-def at_least_past(directory, finding):
+def at_least_past(directory, problem):
     """Route the muscle at the stated distance past the axis of the joint `bend`."""
-    distance = 1e-3 * float(re.search(r'at least ([\d.]+) mm past', finding.remedy)[1])
+    distance = 1e-3 * float(re.search(r'at least ([\d.]+) mm past', problem.remedy)[1])
     route = [('upper', (distance, 0.0, -0.25)), ('lower', (distance, 0.0, -0.1))]
     routed('idler', route)(directory)
 
@@ -195,9 +196,9 @@ def end_of_drum(end):
     return edited(edit)
 
 
-def limit_as_stated(directory, finding):
+def limit_as_stated(directory, problem):
     """Give the joint of a remedy the limits that the remedy states."""
-    joint, *limits = re.match(r'limit (\w+) to the range (.*) to (.*) rad', finding.remedy).groups()
+    joint, *limits = re.match(r'limit (\w+) to the range (.*) to (.*) rad', problem.remedy).groups()
     file = directory / 'robot.urdf'
     start, end = file.read_text().split(f'<joint name="{joint}"')
     for name, limit in zip(('lower', 'upper'), limits, strict=True):
@@ -333,26 +334,26 @@ ROWS = {
 }  # fmt: skip
 
 
-def findings(directory):
+def problems(directory):
     check = check_robot(Robot.load(directory), POSTURES)
     return check, [*check.faults, *check.warnings]
 
 
 @pytest.mark.parametrize('name', ROWS)
-def test_a_finding_is_gone_after_its_remedy(name, tmp_path):
+def test_a_problem_is_gone_after_its_remedy(name, tmp_path):
     row, kind = ROWS[name], name.partition(',')[0]
     for number, edit in enumerate(row.edits):
         directory = tmp_path / str(number)
         row.write(directory)
-        found = [each for each in findings(directory)[1] if each.kind == kind]
+        found = [each for each in problems(directory)[1] if each.kind == kind]
         assert found and row.remedy in found[0].remedy
         edit(directory, found[0])
-        check, left = findings(directory)
+        check, left = problems(directory)
         assert kind not in {each.kind for each in left}, left
         assert not check.faults, (number, check.faults)
 
 
-def test_every_finding_has_a_row_or_a_reason():
-    tried = {key for key in FINDINGS if any((name + ', ').startswith(key + ', ') for name in ROWS)}
+def test_every_problem_has_a_row_or_a_reason():
+    tried = {key for key in PROBLEMS if any((name + ', ').startswith(key + ', ') for name in ROWS)}
     assert tried.isdisjoint(EXCEPTIONS)
-    assert tried | EXCEPTIONS.keys() == FINDINGS.keys()
+    assert tried | EXCEPTIONS.keys() == PROBLEMS.keys()
