@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
+from musculoskeletal_ae.bags.recorded_faults import find_faults
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs, Streams, read_streams
 from musculoskeletal_ae.bags.timed_messages import find_pauses
@@ -25,7 +25,6 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 MOST_REJECTED = 0.1  # report a fault if more than this share of a topic's messages is rejected
 #: report no fault, however many messages are rejected for these reasons: lengths were being
@@ -124,21 +123,6 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
 def _postures(robot: Robot, recording: Pairs, what: str, *, from_motion: bool = False) -> int:
     with ProgressBar(f'counting {what}', len(recording.time)) as bar:
         return count_postures(robot, recording, bar.add, from_motion=from_motion)
-
-
-def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
-    """Return the wiring of a recording: to which muscle each column belongs, and with which sign.
-
-    Column i of the arrays should belong to muscle i of the robot, but arrays carry no names. The
-    lengths are therefore compared with those of the geometric model at the recorded joint angles.
-    Columns of muscles that were isolated at any time are not judged.
-    """
-    straight = Wiring.straight(robot.muscle_count)
-    if np.count_nonzero(np.isfinite(pairs.theta).all(axis=1)) < 2:
-        return straight
-    theta = pairs.theta.clip(robot.lower, robot.upper)
-    used = ~(pairs.isolated == 1).any(axis=0)
-    return judge(robot.muscle_lengths, theta, pairs.length, pairs.tension, used=used).wiring
 
 
 def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[int]]:
@@ -243,11 +227,9 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
         return _Fit([problem, *joint_faults], left_out)
     pairs = streams.pairs()
-    wiring = recorded_wiring(pairs, robot)
+    wiring, sensor_faults = find_faults(robot, pairs)
+    faults = rejected_faults + joint_faults + sensor_faults
     if wiring.faulty:
         what = 'order' if wiring.misplaced else 'signs'
-        faults = [f'the muscles do not have the {what} of {name}: {wiring.text(robot.muscles)}']
-    else:
-        faults = wrong_joint_sensors(robot, pairs)
-    faults = rejected_faults + joint_faults + faults
+        faults.append(f'the muscles do not have the {what} of {name}: {wiring.text(robot.muscles)}')
     return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs), True)

@@ -32,8 +32,8 @@ def definition(type_name: str) -> str:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the RIHS01 hash of a type, by which recorders identify its definition."""
-    return TYPESTORE.hash_rihs01(type_name)
+    """Return the RIHS01 hash by which recorders identify a definition; '' for unknown types."""
+    return TYPESTORE.hash_rihs01(type_name) if is_known(type_name) else ''
 
 
 def is_known(type_name: str) -> bool:

@@ -21,6 +21,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.metadata import dump_qos_v9
 
+from musculoskeletal_ae.bags.message_types import type_hash
 from musculoskeletal_ae.bags.storage import CONVERT, NAME_A_BAG, BagTopic, reading
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_yaml
@@ -71,7 +72,7 @@ def qos_text(profiles: Sequence[Qos]) -> str:
 def write_metadata(
     directory: Path,
     name: str,
-    topics: Iterable[tuple[BagTopic, str]],
+    topics: Iterable[BagTopic],
     times: tuple[int, int] | None,
     finished: bool,
     custom: Mapping[str, str] | None = None,
@@ -81,7 +82,7 @@ def write_metadata(
     Args:
         directory: The bag directory.
         name: Name of its only mcap file.
-        topics: Each topic with the hash of its type, '' if unknown.
+        topics: The topics, with the numbers of their messages.
         times: The earliest and the latest log time [ns]; None without messages.
         finished: Whether the recording has ended; the file is then synchronised to disk, to
             survive a power failure.
@@ -90,7 +91,7 @@ def write_metadata(
     start, end = times or (_NO_TIME, _NO_TIME)
     duration = {'nanoseconds': end - start}
     starting_time = {'nanoseconds_since_epoch': start}
-    entries = [_topic_entry(topic, type_hash) for topic, type_hash in topics]
+    entries = [_topic_entry(topic) for topic in topics]
     count = sum(entry['message_count'] for entry in entries)
     file = {
         'path': name,
@@ -121,13 +122,13 @@ def write_metadata(
     new.replace(directory / FILE)
 
 
-def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
+def _topic_entry(topic: BagTopic) -> Mapping[str, Any]:
     metadata = {
         'name': topic.name,
         'type': topic.type,
         'serialization_format': topic.encoding,
         'offered_qos_profiles': dump_qos_v9(topic.qos),
-        'type_description_hash': type_hash,
+        'type_description_hash': type_hash(topic.type),
     }
     return {'topic_metadata': metadata, 'message_count': topic.message_count}
 

@@ -27,7 +27,6 @@ from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.messages.message_reading import MOST_ENTRIES, target_values
 
-LONGEST_LAG = 1.0  # after an interruption longer than this [s], do not catch up
 #: after skipping a pause of the recording, continue this long before the next message, in recorded
 #: time [ns]
 SKIP_LEAD = 500_000_000

@@ -74,21 +74,20 @@ class Bag:
     @property
     def start(self) -> int:
         """Earliest log time [ns], 0 without messages."""
-        return min((file.start for file in self.files), default=0) if self.message_count else 0
+        return min(file.start for file in self.files) if self.message_count else 0
 
     @property
     def end(self) -> int:
         """Latest log time [ns], 0 without messages."""
-        return max((file.end for file in self.files), default=0)
+        return max(file.end for file in self.files)
 
     def messages(
         self, topics: Collection[str] | None = None, start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
         """Yield the messages whose log times are from `start` to `stop` [ns], both included.
 
-        The messages are sorted by log time, unless a file is more than 10 s out of order or has
-        more than 64 MiB of messages to sort at once. Messages with the same time keep the order of
-        the file.
+        The messages are sorted by log time, unless more than 64 MiB of messages would have to be
+        sorted at once. Messages with the same time keep the order of the file.
 
         Args:
             topics: Recorded names of the topics, or None for all topics.
@@ -132,10 +131,9 @@ def _open_file(path: Path) -> StorageFile:
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Yield the messages sorted by log time.
+    """Yield the messages of a file, which are at most LONGEST_PAUSE out of order, by log time.
 
-    Messages that are more than 10 s (LONGEST_PAUSE) out of order are not sorted. Neither are
-    messages whose sorting would require more than 64 MiB (MOST_HELD) of memory.
+    Messages whose sorting would require more than 64 MiB (MOST_HELD) of memory are not sorted.
     """
     waiting: list[tuple[int, int, BagMessage]] = []
     newest = held = 0

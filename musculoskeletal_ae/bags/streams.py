@@ -17,7 +17,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import EARLIER, interface_topics
-from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
@@ -27,6 +27,7 @@ from musculoskeletal_ae.messages.message_reading import (
 )
 from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.urdf import parse_xml
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
@@ -68,9 +69,7 @@ class Streams(NamedTuple):
     ignored: Counter[str]  # unused parts of messages by topic and part
     notes: tuple[str, ...]  # further remarks for the user
     judged_joints: JointSeries  # which readings of all messages of joint_states are usable
-    false_joints: (
-        Array  # times of the messages of joint_states without any usable reading [s], (F,)
-    )
+    false_joints: Array  # times of messages of joint_states without a usable reading [s], (F,)
 
     def pairs(self) -> Pairs:
         """Pair each muscle message with the joint angles at the same time.
@@ -297,7 +296,8 @@ def read_streams(
 
     Raises:
         BagError: If no message of a topic fits the robot, the bag is damaged, or `interface_topics`
-            raises an error.
+            raises an error. Also if there are no joint angles, and the recorded
+            `robot_description` is that of another robot.
     """
     recorded = interface_topics(bag, namespace, robot.description.motor_topics)
     labels = _labels(recorded)
@@ -327,9 +327,34 @@ def read_streams(
     judged = judge_series(robot, joints.time, joints.values)
     is_usable, times_read = np.isfinite(judged.theta).any(axis=1), joints.time
     joints = Series(joints.time[is_usable], judged.theta[is_usable])
+    if not len(joints.time):
+        _check_description(bag, recorded.get('robot_description'), robot)
     series = joints, states.time, readings, arm.isolated()
     false = times_read[~is_usable]
     return Streams(*series, reception.rejected, reception.ignored, notes, judged, false)
+
+
+def described_robot(bag: Bag, topic: str | None) -> tuple[str, list[str]]:
+    """Return the name and the movable joints of the URDF in a recording.
+
+    They are '' and [] if the recording has no URDF.
+
+    Args:
+        bag: The recording.
+        topic: Recorded name of the topic `robot_description`, or None if it was not recorded.
+    """
+    for message in bag.messages([topic] if topic else []):
+        try:
+            root = parse_xml(bag.path, bag.decode(message).data)
+        except MusculoskeletalError:
+            continue
+        joints = [
+            joint.get('name', '')
+            for joint in root.iterfind('joint')
+            if joint.get('type') != 'fixed'
+        ]
+        return root.get('name', ''), joints
+    return '', []
 
 
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
@@ -407,6 +432,21 @@ def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -
             problem = f'no message of {label} fits the robot ({reasons[-1]})'
             is_of_shape = reasons[-1].startswith(OTHER_ROBOT)
             raise BagError(bag.path, problem, CHOOSE_ROBOT if is_of_shape else CHECK_DRIVER)
+
+
+def _check_description(bag: Bag, topic: str | None, robot: Robot) -> None:
+    """Check that the URDF in a recording without joint angles has the joints of the robot.
+
+    Otherwise, only the number of muscles would be known to fit. The arguments are as in
+    `described_robot`.
+
+    Raises:
+        BagError: If the URDF lacks a joint of the robot.
+    """
+    _, described = described_robot(bag, topic)
+    if described and not set(robot.joints) <= set(described):
+        problem = f'its robot_description has the joints {", ".join(described)}'
+        raise BagError(bag.path, problem, CHOOSE_ROBOT)
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:

@@ -13,7 +13,8 @@ publish times have errors of their own: the clock of another computer drifts, an
 recorder with `use_sim_time` runs at another rate.
 
 Log times may also jump forward, because the recorder was paused, or because its clock was set.
-Jumps of more than `LONGEST_PAUSE` count as pauses. Backward jumps are refused when a bag is opened.
+Jumps of more than `LONGEST_PAUSE` count as pauses. Backward jumps are refused when an mcap file is
+opened; rosbags reads messages of sqlite3 files in the order of their log times.
 """
 
 from __future__ import annotations

@@ -108,8 +108,9 @@ def select(
         names = {name: interface_name(name) for name in bag.topics} | _motor_topics(bag, motors)
     else:
         names = _relative_names(bag, namespace, motors)
-    topics_of_bag = _topics_of(bag)
+    topics_of_bag, leave_out = _topics_of(bag), ''
     if list(wanted) in ([DEFAULT], [ALL]):
+        leave_out = ', or select the other topics with --topics NAME,…'
         sent = [*SENT, motors.states]
         relevant = sent if wanted[0] == DEFAULT else [*topics]
         chosen = [name for name, relative in names.items() if relative in relevant]
@@ -123,8 +124,6 @@ def select(
         for one in wanted:
             if one not in {*names, *names.values()}:
                 raise BagError(bag.path, f'topic {one} is not in the bag', topics_of_bag)
-    is_choice = list(wanted) not in ([DEFAULT], [ALL])
-    leave_out = '' if is_choice else ', or select the other topics with --topics NAME,…'
     for name in chosen:
         topic = topics.get(names[name])
         _compare_type(bag, name, topic.type if topic else bag.topics[name].type, leave_out)

@@ -46,7 +46,6 @@ class BagWriter:
             raise BagError(self.directory, problem, 'choose another name') from error
         #: further entries of metadata.yaml, which are written when the bag is completed
         self.custom: dict[str, str] = {}
-        self._hashes: dict[str, str] = {}  # hashes of the types, by topic
         self._channels: dict[str, int] = {}  # numbers of the channels, by topic
         self._schemas: dict[str, int] = {}  # numbers of the schemas, by type
         self._pending: list[tuple[int, str, int, bytes]] = []
@@ -84,9 +83,7 @@ class BagWriter:
             qos: Offered QoS profiles.
             schema: Definition to copy if ROS 2 Jazzy does not define the type.
         """
-        type_hash = ''
         if message_types.is_known(type_name):
-            type_hash = message_types.type_hash(type_name)
             text = message_types.definition(type_name).encode()
             schema = Schema(0, text, message_types.MSG, type_name)
         elif schema is None:
@@ -94,11 +91,13 @@ class BagWriter:
         if type_name not in self._schemas:
             number = self._mcap.register_schema(type_name, schema.encoding, schema.data)
             self._schemas[type_name] = number
-        extra = {'offered_qos_profiles': metadata.qos_text(qos), 'topic_type_hash': type_hash}
+        extra = {
+            'offered_qos_profiles': metadata.qos_text(qos),
+            'topic_type_hash': message_types.type_hash(type_name),
+        }
         self._channels[name] = self._mcap.register_channel(
             name, message_types.CDR, self._schemas[type_name], extra
         )
-        self._hashes[name] = type_hash
         self.topics[name] = BagTopic(name, type_name, qos=list(qos))
         self._has_new_topics = True
 
@@ -149,10 +148,14 @@ class BagWriter:
                 self._file.close()
 
     def _write_metadata(self, finished: bool) -> None:
-        topics = [(topic, self._hashes[name]) for name, topic in self.topics.items()]
         with self._writing():
             metadata.write_metadata(
-                self.directory, self._name, topics, self._times, finished, self.custom
+                self.directory,
+                self._name,
+                self.topics.values(),
+                self._times,
+                finished,
+                self.custom,
             )
         self._has_new_topics = False
 

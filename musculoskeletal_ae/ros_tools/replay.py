@@ -22,13 +22,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from musculoskeletal_ae.bags.playback import (
-    LONGEST_LAG,
-    TAUGHT_TOPIC,
-    Timeline,
-    lap,
-    window,
-)
+from musculoskeletal_ae.bags.playback import TAUGHT_TOPIC, Timeline, lap, window
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
@@ -76,6 +70,7 @@ WAIT = 2.0  # by default, wait at most this long for subscribers, and then play 
 SEND_WAIT = 10.0
 CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
 SLOW = 0.5  # report playback as slow below this share of the wanted speed
+LONGEST_LAG = 1.0  # after an interruption longer than this [s], do not catch up
 LOCKSTEP_LAG = 0.005  # in lockstep, do not catch up after a longer delay than this [s]
 #: publish /clock at intervals of at least this wall time [s]; nodes cannot use a faster clock
 SHORTEST_CLOCK_PERIOD = 0.001

@@ -13,12 +13,11 @@ from pathlib import Path
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
-from musculoskeletal_ae.bags.streams import read_streams
+from musculoskeletal_ae.bags.streams import described_robot, read_streams
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.urdf import parse_xml
 
 #: first read this much time of a recording [ns], which reveals most wrong robots quickly
 BEGINNING = 2_000_000_000
@@ -37,7 +36,7 @@ def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
     """
     robot = Robot.load(name)
     # First raise errors that do not depend on the robot.
-    interface_topics(bag, namespace, robot.description.motor_topics)
+    topics = interface_topics(bag, namespace, robot.description.motor_topics)
     # The first messages may be faulty, so read the whole recording before refusing it.
     for stop in bag.start + BEGINNING, LATEST:
         problem = _problem(bag, robot, namespace, stop)
@@ -52,7 +51,7 @@ def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
         remedy = f'it fits {", ".join(fits)}; pass --robot {fits[0]}'
     else:
         remedy = 'pass --robot with the directory of the robot that was recorded'
-        recorded, joints = _described(bag, robot, namespace)
+        recorded, joints = described_robot(bag, topics.get('robot_description'))
         if joints:
             stated = f'its robot_description is that of {recorded!r}, with the joints '
             remedy = f'{stated}{", ".join(joints)}; {remedy}'
@@ -63,37 +62,10 @@ def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
 def _problem(bag: Bag, robot: Robot, namespace: str | None, stop: int) -> str:
     """Return why the messages up to a log time [ns] do not fit a robot; '' if they do."""
     try:
-        streams = read_streams(bag, robot, namespace, stop=stop)
+        read_streams(bag, robot, namespace, stop=stop)
     except BagError as error:
         return error.problem
-    if len(streams.joints.time):
-        return ''
-    # Without joint sensors, only the number of muscles is known to fit.
-    _, described = _described(bag, robot, namespace)
-    if described and not set(robot.joints) <= set(described):
-        return f'its robot_description has the joints {", ".join(described)}'
     return ''
-
-
-def _described(bag: Bag, robot: Robot, namespace: str | None) -> tuple[str, list[str]]:
-    """Return the name and the movable joints of the URDF in a recording.
-
-    They are '' and [] if the recording has no URDF. `namespace` is that of the recorded topics.
-    """
-    topics = interface_topics(bag, namespace, robot.description.motor_topics)
-    topic = topics.get('robot_description')
-    for message in bag.messages([topic] if topic else []):
-        try:
-            root = parse_xml(bag.path, bag.decode(message).data)
-        except MusculoskeletalError:
-            continue
-        joints = [
-            joint.get('name', '')
-            for joint in root.iterfind('joint')
-            if joint.get('type') != 'fixed'
-        ]
-        return root.get('name', ''), joints
-    return '', []
 
 
 def main(arguments: list[str]) -> int:

@@ -12,10 +12,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.bags.check import recorded_wiring
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
-from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.bags.recorded_faults import find_faults
+from musculoskeletal_ae.bags.streams import CHECK_DRIVER, Pairs, read_streams
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
@@ -255,18 +254,20 @@ def _check_range(robot: Robot, source: TableSource) -> None:
 
 
 def _warnings(robot: Robot, sources: list[TableSource], is_csv: bool) -> Iterator[str]:
-    """Yield warnings about joint sensors and, in CSV files, about the columns of muscles."""
+    """Yield warnings about the joint sensors and, if learned from, the columns of muscles."""
+    if is_csv:
+        remedy = (
+            '. Correct the columns with --columns, and signs with a negative number as unit: '
+            '--units length=-1'
+        )
+    else:
+        remedy = f'; {CHECK_DRIVER}'
     for source in sources:
-        rows = source.table.rows
-        for text in wrong_joint_sensors(robot, rows, source.table.at_rest):
+        wiring, texts = find_faults(robot, source.table.rows, source.table.at_rest)
+        for text in texts:
             yield f'{source.name}: {text}'
-        if is_csv and not source.is_held_out:
-            wiring = recorded_wiring(rows, robot)
-            if wiring.faulty:
-                yield (
-                    f'{source.name}: {wiring.text(robot.muscles)}. Correct the columns with '
-                    '--columns, and signs with a negative number as unit: --units length=-1'
-                )
+        if wiring.faulty and not source.is_held_out:
+            yield f'{source.name}: {wiring.text(robot.muscles)}{remedy}'
 
 
 def _initial_network(robot: Robot, args: Namespace) -> Mae:

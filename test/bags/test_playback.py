@@ -8,7 +8,6 @@ from numpy.testing import assert_array_equal
 from bags import bag_samples as samples
 from bags.arm_bag import JOINTS, Arm, joints
 from musculoskeletal_ae.bags.playback import (
-    LONGEST_LAG,
     TAUGHT_TOPIC,
     Timeline,
     lap,
@@ -54,9 +53,9 @@ def test_a_step_makes_everything_up_to_its_time_due():
 
 def test_after_a_long_stop_of_the_process_it_goes_on_instead_of_catching_up():
     timeline = Timeline(0, 1.0, now=0.0)
-    timeline.catch_up(SECOND, 1.0 + 0.9 * LONGEST_LAG, LONGEST_LAG)
+    timeline.catch_up(SECOND, 1.9, longest=1.0)
     assert timeline.wait(2 * SECOND, 2.0) == 0.0
-    timeline.catch_up(SECOND, 100.0, LONGEST_LAG)
+    timeline.catch_up(SECOND, 100.0, longest=1.0)
     assert timeline.wait(2 * SECOND, 100.0) == 1.0
 
 

@@ -4,6 +4,7 @@
 import pytest
 
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, string
+from musculoskeletal_ae.bags.check import check_bag
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.recorded_robot import main, misfit
@@ -46,6 +47,9 @@ def test_without_joint_sensors_the_description_tells_robots_with_equal_muscles_a
     arm.add('/robot_description', STRING, 0.0, string(URDF))
     problem = misfit(Bag.open(arm.write(tmp_path / 'second')), 'arm26')
     assert 'its robot_description has the joints turn' in problem
+    (fault,) = check_bag(tmp_path / 'second', 'arm26').faults
+    assert 'its robot_description has the joints turn; choose the robot' in fault
+    assert not any('arm26' in line for line in check_bag(tmp_path / 'second').lines)
 
 
 def test_what_is_no_recording_is_an_error_in_one_line(tmp_path, capsys):

@@ -8,9 +8,9 @@ from robots import with_modules
 
 from bags import bag_samples as samples
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
-from musculoskeletal_ae.bags.check import check_bag, motion_text, recorded_wiring
+from musculoskeletal_ae.bags.check import check_bag, motion_text
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
+from musculoskeletal_ae.bags.recorded_faults import find_faults
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
@@ -149,7 +149,7 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path,
     assert_array_equal(pairs.tension[:100, 1:], arm.tension[:100, 1:])
     swapped = pairs._replace(length=pairs.length[:, [1, 0, *range(2, count)]])
     # Muscles that were isolated at any time are not compared, so no column counts as misplaced.
-    assert not recorded_wiring(swapped, robot).faulty
+    assert not find_faults(robot, swapped).wiring.faulty
 
 
 def test_isolated_muscles_are_unknown_if_the_bag_does_not_contain_them(arm, robot, tmp_path):
@@ -165,7 +165,7 @@ def test_some_joint_sensors_will_do(robot, tmp_path):
     pairs = streams(arm, robot, tmp_path).pairs()
     assert_array_equal(pairs.theta[:, 1:], arm.theta[:, 1:])
     assert np.isnan(pairs.theta[:, 0]).all()
-    assert not recorded_wiring(pairs, robot).faulty  # the comparison requires all joint angles
+    assert not find_faults(robot, pairs).wiring.faulty  # the comparison requires all joint angles
 
 
 def test_a_message_that_was_sent_before_the_last_one_is_left_out(arm, robot, tmp_path):
@@ -183,7 +183,27 @@ def test_a_recording_of_another_arm_is_refused(arm, tmp_path):
 def test_muscles_in_another_order_are_named(robot, tmp_path):
     order = [1, 0, *range(2, robot.muscle_count)]
     result = streams(Arm(robot, order=order), robot, tmp_path)
-    assert recorded_wiring(result.pairs(), robot).misplaced == {0: 1, 1: 0}
+    assert find_faults(robot, result.pairs()).wiring.misplaced == {0: 1, 1: 0}
+
+
+@pytest.mark.parametrize('joint', [0, 1])
+def test_a_reversed_joint_sensor_is_named_and_no_muscle_of_a_symmetric_arm(joint, robot, tmp_path):
+    arm = Arm(robot)
+    sign = np.ones(robot.joint_count)
+    sign[joint] = -1.0
+    theta = iter(arm.theta * sign)
+    arm.content = [
+        each._replace(data=joints(robot.joints, next(theta))) if each.type == JOINTS else each
+        for each in arm.content
+    ]
+    (fault,) = check_bag(arm.write(tmp_path / 'bag'), 'arm26').faults
+    assert f'the sign of these joint sensors is reversed: {robot.joints[joint]}. Publish' in fault
+
+
+def test_exchanged_muscles_are_named_and_no_joint_sensor(robot, tmp_path):
+    arm = Arm(robot, order=[*reversed(range(robot.muscle_count))])
+    wiring, joint_sensors = find_faults(robot, streams(arm, robot, tmp_path).pairs())
+    assert set(wiring.faulty) == set(range(robot.muscle_count)) and not joint_sensors
 
 
 def test_muscles_in_their_order_are_not_doubted_for_noise_and_offsets(arm, robot, tmp_path):
@@ -191,7 +211,7 @@ def test_muscles_in_their_order_are_not_doubted_for_noise_and_offsets(arm, robot
     pairs = streams(arm, robot, tmp_path).pairs()
     scale = rng.uniform(0.8, 1.2, robot.muscle_count)
     length = pairs.length * scale + rng.normal(0.0, 0.002, pairs.length.shape) + 0.05
-    assert not recorded_wiring(pairs._replace(length=length), robot).faulty
+    assert not find_faults(robot, pairs._replace(length=length)).wiring.faulty
 
 
 def test_the_check_says_what_is_in_a_bag_and_what_it_fits(arm, tmp_path):
@@ -355,8 +375,8 @@ def test_recordings_of_a_robot_without_tensions_are_judged_and_unused_tensions_n
     silent = Robot(modules)
     result = streams(arm, silent, tmp_path)
     assert_allclose(result.pairs().tension, np.tile(silent.actuation.assumed_tension, (200, 1)))
-    assert not recorded_wiring(result.pairs(), silent).faulty
-    assert not wrong_joint_sensors(silent, result.pairs())
+    assert not find_faults(silent, result.pairs()).wiring.faulty
+    assert not find_faults(silent, result.pairs()).joint_sensors
     (note,) = result.notes
     assert note.startswith('muscle_states has tensions from ') and 'tension_source: sensor' in note
     (tmp_path / 'other').mkdir()

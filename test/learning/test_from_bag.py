@@ -11,7 +11,7 @@ import pytest
 from musculoskeletal_ae import progress_bar
 from musculoskeletal_ae.bags.message_types import TYPESTORE
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
+from musculoskeletal_ae.bags.recorded_faults import find_faults
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
@@ -164,8 +164,9 @@ def test_wrong_bags_and_options_end_with_one_clear_error(
     assert not out.exists()
 
 
-def test_progress_and_wrong_joint_sensors_are_reported(
-    arm26, initial, monkeypatch, tmp_path, capsys
+@pytest.mark.parametrize('fault', ['joint sensor', 'muscles'])
+def test_progress_and_faults_of_the_readings_are_reported(
+    fault, arm26, initial, monkeypatch, tmp_path, capsys
 ):
     time = 0.02 * np.arange(1000)
     # After the first reading, the arm never rests.
@@ -174,7 +175,13 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     tension = np.full((1000, arm26.muscle_count), 60.0)
     length = arm26.muscle_lengths(theta, tension)
     unknown = np.full(tension.shape, -1)
-    recording = Pairs(time, theta * [-1.0, 1.0], length, tension, unknown)
+    if fault == 'joint sensor':
+        theta = theta * [-1.0, 1.0]
+        expected = f'sign of these joint sensors is reversed: {arm26.joints[0]}. Publish θ'
+    else:
+        length = length[:, [1, 0, 2, 3, 4, 5]]
+        expected = f'readings of {arm26.muscles[0]} and {arm26.muscles[1]} are exchanged; if this'
+    recording = Pairs(time, theta, length, tension, unknown)
 
     def trained(_robot, _preset, _seed, progress, steps):
         for step in range(steps):
@@ -196,7 +203,7 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     assert said < trained_at
     assert Path(out).exists()
     (warning,) = {line for line in printed.err.splitlines() if line.startswith('warning: BAG: ')}
-    assert f'sign of these joint sensors is reversed: {arm26.joints[0]}. Publish θ' in warning
+    assert expected in warning
 
 
 def test_an_arm_that_stands_still_is_refused_before_the_training(
@@ -296,14 +303,14 @@ def test_ctrl_c_keeps_what_was_learned_and_leaves_the_earlier_network(
 
 @pytest.mark.thorough
 def test_the_joint_sensors_of_a_recording_of_the_foreign_arm_are_correct(robot):
-    assert not wrong_joint_sensors(robot, read(BAGS / 'foreign', robot))
+    assert not find_faults(robot, read(BAGS / 'foreign', robot)).joint_sensors
 
 
 def test_a_joint_sensor_that_fails_during_a_recording_is_named_with_the_times(robot, teaching):
-    assert not wrong_joint_sensors(robot, teaching)
+    assert not find_faults(robot, teaching).joint_sensors
     theta, fails = teaching.theta.copy(), (teaching.time > 15.0) & (teaching.time < 25.0)
     theta[fails, 3] = 0.0
-    (warning,) = wrong_joint_sensors(robot, teaching._replace(theta=theta))
+    (warning,) = find_faults(robot, teaching._replace(theta=theta)).joint_sensors
     assert f'joint sensor {robot.joints[3]} repeats one reading from 15.' in warning
 
 
