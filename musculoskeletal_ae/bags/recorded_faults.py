@@ -37,9 +37,9 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
     arm moves. Muscles that are isolated at any time during the recording are left out of the
     comparison.
 
-    On a symmetric arm, angles with the wrong sign look like exchanged muscles, and the reverse.
-    Only the joint sensors are reported if correcting their angles explains the lengths. Only the
-    muscles are reported if their right order and signs explain the lengths clearly better (BETTER).
+    On a symmetric arm, angles with the wrong sign look like exchanged muscles. If faults of joint
+    sensors and of muscles could explain the lengths, only those of the joint sensors are reported,
+    unless those of the muscles explain the lengths clearly better (`wiring.BETTER`).
 
     Args:
         robot: The geometric model.
@@ -58,6 +58,7 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
     muscles = judge(robot.muscle_lengths, inside, length, tension, used=used)
     faults = joint_sensors.judge(robot, theta, length, tension, used, segments).faults
     if muscles.is_faulty:
+        # Compare it with the misfit of the muscles as they are, at the corrected angles.
         meant = joint_sensors.corrected(theta, faults, robot.units).clip(robot.lower, robot.upper)
         (square,) = square_misfits(robot.muscle_lengths, meant, length, tension)
         misfit = np.sqrt(square.diagonal()[used].sum())
