@@ -21,7 +21,7 @@ from tqdm import tqdm
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.trainer import TrainerProcess
+from musculoskeletal_ae.learning.training_process import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
 

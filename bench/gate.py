@@ -7,7 +7,7 @@ For each individual and preset, a learner learns from an exploring arm that carr
 second minute. Each published checkpoint is validated on the messages of the arm. The bench prints:
 
 - each measure of the networks: its largest value over all of them, and its limit,
-- each measure of the messages: its largest value, and its limit (`signals/limits.py`),
+- each measure of the messages: its largest value, and its limit (`signals/reading_limits.py`),
 - the networks that were refused (there should be none),
 - how many initial and final networks are refused after each attack on them.
 
@@ -41,8 +41,8 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
-from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
-from musculoskeletal_ae.signals.limits import share_outside
+from musculoskeletal_ae.signals.reading_limits import LIMITS as SIGNAL_LIMITS
+from musculoskeletal_ae.signals.reading_limits import share_outside
 
 LOAD = 3.6  # let the arm carry this payload every second minute [kg]
 MINUTE = 60.0  # add or remove the payload at this interval [s]

@@ -15,7 +15,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae

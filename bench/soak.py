@@ -35,7 +35,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.scheduler import STEPS, Job
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot

@@ -57,9 +57,9 @@ from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+from musculoskeletal_ae.signals.reading_limits import LIMITS, Persistence, check_posture
 
 WINDOW = 3  # take the median of this many messages, so that a single outlier has no effect
 RESTORE = 'call estimator/restore to use isolated muscles again'

@@ -30,7 +30,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.joint_sensors import JointFault
 from musculoskeletal_ae.signals.joint_series import judge_series
-from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_states import (
     QUANTITIES,
@@ -40,6 +39,7 @@ from musculoskeletal_ae.signals.muscle_states import (
     possible_readings,
     read_muscle_states,
 )
+from musculoskeletal_ae.signals.reading_limits import length_range
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
 #: report a fault if more than this share of the messages repeats the previous message exactly

@@ -50,8 +50,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
-from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+from musculoskeletal_ae.signals.reading_limits import Persistence
 
 #: Use measured joint angles with a message of the muscles only if they are younger than this [s]:
 #: an older reading belongs to another posture of a moving arm.

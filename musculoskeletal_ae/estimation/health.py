@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.estimation.contact import Contact
-from musculoskeletal_ae.estimation.detectors.exchange import ExchangeCheck
+from musculoskeletal_ae.estimation.detectors.exchanged_muscles import ExchangeCheck
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import JointSensorTrust
 from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement

@@ -25,8 +25,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS, slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.reading_limits import LIMITS, slack_tension
 
 #: Refuse to use a repaired muscle if its length l differs from the predicted length l' by more than
 #: this [m]: the first limit is for networks with a calibrated detector, the second for all others.

@@ -52,7 +52,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.signals.limits import slack_tension
+from musculoskeletal_ae.signals.reading_limits import slack_tension
 
 #: conclude that the suspect is being wound in once its length command has decreased by more than
 #: this [m]

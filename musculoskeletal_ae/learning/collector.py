@@ -29,9 +29,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired, Pairing
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 #: sources of θ: sensors of some or all joints, a camera at irregular intervals, or none
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'

@@ -37,7 +37,7 @@ from musculoskeletal_ae.learning.detector_calibration import Reservoir, uncalibr
 from musculoskeletal_ae.learning.learner_status import learner_conditions, learner_report
 from musculoskeletal_ae.learning.samples import HELD_TIME, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, Update, UpdateScheduler
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.report import Report

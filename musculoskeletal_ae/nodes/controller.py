@@ -54,7 +54,7 @@ from musculoskeletal_ae.ros.message_building import (
     serve,
 )
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 #: compute a command after this number of periods without an estimate, so that stale messages stop
 #: the arm

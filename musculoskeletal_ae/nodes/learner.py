@@ -17,7 +17,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.trainer import TrainerProcess
+from musculoskeletal_ae.learning.training_process import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.messages.arrival import SPACING
 from musculoskeletal_ae.messages.message_reading import read_imu

@@ -35,7 +35,7 @@ from musculoskeletal_ae.signals.joint_stream import (
     JointReading,
     JointStream,
 )
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 #: treat a repeated value as false if at least this share of its appearances begins and ends with a
 #: jump

@@ -30,7 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 #: accept a change of at most this plus SPEED · dt between two readings of a joint sensor [rad]; it
 #: is far beyond the noise, resolution and backlash of sensors

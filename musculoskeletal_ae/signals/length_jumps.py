@@ -29,7 +29,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.messages.arrival import longer_pause
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
+from musculoskeletal_ae.signals.reading_limits import LENGTH_JUMPED, LIMITS
 
 #: remember a change of a length, as a possible part of a jump, if it exceeds this fraction of the
 #: largest legal change

@@ -29,7 +29,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages.message_reading import read_rows
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension_source import TensionSource
-from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths, reading_range
+from musculoskeletal_ae.signals.reading_limits import LIMITS, longest_lengths, reading_range
 
 #: replace larger values of isolated muscles by NaN, because they could overflow when squared
 MOST_ISOLATED = 1e6

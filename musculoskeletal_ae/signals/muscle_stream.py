@@ -7,11 +7,11 @@
 A message with an illegal shape, an implausible level or a jump raises a `RejectionError`, which
 names the reason and the value; for a level also the legal range. A temperature that changes
 implausibly fast does not reject a message: the sample has the last accepted temperature. Nodes,
-bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits. Values of isolated
-muscles are not checked. A rejected message may contain valid tensions, for example if only a length
-jumped. `RejectionError.plausible` contains these tensions for the limiter. After a jump, messages
-are rejected until the new level has lasted (`length_jumps`). While the length offsets are unknown,
-no message is rejected because of a jump or the level of a length.
+bags and experiments all use `MuscleStream`; `signals/reading_limits.py` has the limits. Values of
+isolated muscles are not checked. A rejected message may contain valid tensions, for example if only
+a length jumped. `RejectionError.plausible` contains these tensions for the limiter. After a jump,
+messages are rejected until the new level has lasted (`length_jumps`). While the length offsets are
+unknown, no message is rejected because of a jump or the level of a length.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 from musculoskeletal_ae.signals.length_jumps import LengthJumps
-from musculoskeletal_ae.signals.limits import LIMITS, Persistence
 from musculoskeletal_ae.signals.muscle_states import (
     MuscleReadings,
     raw_muscle_states,
     read_muscle_states,
 )
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
+from musculoskeletal_ae.signals.reading_limits import LIMITS, Persistence
 
 
 class RejectionError(MessageError):

@@ -10,8 +10,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS, slack_tension
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings, first, possible_readings
+from musculoskeletal_ae.signals.reading_limits import LIMITS, slack_tension
 
 
 class LevelCheck:

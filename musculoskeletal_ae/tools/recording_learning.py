@@ -44,9 +44,9 @@ from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings, possible_readings
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 from musculoskeletal_ae.tables.columns import UNITS, Column
 from musculoskeletal_ae.tables.csv_file import looks_like_a_sequence, read_csv
 from musculoskeletal_ae.tables.table import Table, TableError

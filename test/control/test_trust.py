@@ -20,8 +20,8 @@ from musculoskeletal_ae.control.supervisor import RESUME
 from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, Overload
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.signals.body_state import Trust
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_states import QUANTITIES
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 TICK = 0.1 * DT  # largest change of a length command in one step under the rate limit [m]
 MUSCLE = ROBOT.muscles[0]

@@ -18,8 +18,8 @@ from musculoskeletal_ae.estimation.finding import Detector
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 DT = 0.01
 

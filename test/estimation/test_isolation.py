@@ -17,8 +17,8 @@ from musculoskeletal_ae.estimation.suspect_verification import (
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.remedy_steps import REPAIR
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 BIAS, STIFFNESS, DT = 30.0, 1e4, 0.01
 NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]

@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.scheduler import Update
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.signals.body_state import Anomaly

@@ -10,7 +10,7 @@ from robots import write_robot
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.scheduler import Update
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets

@@ -14,8 +14,8 @@ from musculoskeletal_ae.learning.detector_calibration import Reservoir
 from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
+from musculoskeletal_ae.signals.reading_limits import LIMITS
 
 DT = 0.01
 

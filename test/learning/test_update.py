@@ -12,7 +12,7 @@ from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION, synthetic_
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body_updater import BodyUpdater, learned_steps
 from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import scale_vector

@@ -22,7 +22,7 @@ from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import state_directory as states
 from musculoskeletal_ae.learning.state_directory import NETWORK, NEWEST
-from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode

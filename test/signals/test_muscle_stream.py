@@ -15,7 +15,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import muscle_states
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.friction import Transmission
-from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
 from musculoskeletal_ae.signals.muscle_states import (
     QUANTITIES,
     MuscleReadings,
@@ -23,6 +22,7 @@ from musculoskeletal_ae.signals.muscle_states import (
     Quantity,
 )
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
+from musculoskeletal_ae.signals.reading_limits import LIMITS, longest_lengths
 
 ROBOT = Robot.load('arm26')
 M = ROBOT.muscle_count

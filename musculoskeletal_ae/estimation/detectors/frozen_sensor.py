@@ -12,7 +12,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import slack_tension
+from musculoskeletal_ae.signals.reading_limits import slack_tension
 
 FROZEN_TIME = 1.0  # suspect a sensor whose reading has stayed the same for this long [s]
 #: report a constant tension near T_bias only if this sensor usually has noise there: more than the

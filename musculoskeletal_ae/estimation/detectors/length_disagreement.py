@@ -33,8 +33,8 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.reading_limits import slack_tension
 
 SPACING = 0.1  # compare measured and computed lengths at this interval [s]
 COUNT = 10  # take the median of this many comparisons, so that single outliers do not matter

@@ -39,7 +39,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import slack_tension
+from musculoskeletal_ae.signals.reading_limits import slack_tension
 
 FAULTY = 1.0  # report a module once the evidence against it amounts to this time [s]
 #: smooth differences from the command, and winding speeds, with this time constant [s]

@@ -38,8 +38,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.reading_limits import slack_tension
 
 DISTANCE = 'distance'  # name under which a checkpoint stores the threshold of the distance d
 

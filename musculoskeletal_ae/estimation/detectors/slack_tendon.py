@@ -35,8 +35,8 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.lengths.length_errors import LengthErrors, Prediction
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS, share_outside, slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.reading_limits import LIMITS, share_outside, slack_tension
 
 #: report a tendon without tension if its stretch exceeds the expected stretch by this many standard
 #: deviations

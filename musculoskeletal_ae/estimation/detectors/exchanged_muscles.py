@@ -31,8 +31,8 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
+from musculoskeletal_ae.signals.reading_limits import slack_tension
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 SPACING = 0.25  # store at most one message in this time [s]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from processes import is_running
 
-from musculoskeletal_ae.learning import trainer as trainers
-from musculoskeletal_ae.learning.trainer import Trainer, TrainerProcess
+from musculoskeletal_ae.learning import training_process as trainers
+from musculoskeletal_ae.learning.training_process import Trainer, TrainerProcess
 
 from .conftest import job
 
