@@ -14,7 +14,8 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.problems import read_problems
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors
-from musculoskeletal_ae.signals.wiring import BETTER, Wiring, judge, square_misfits
+from musculoskeletal_ae.signals.joint_sensors import JointFault
+from musculoskeletal_ae.signals.wiring import BETTER, Wiring, judge
 
 #: compare joint angles and lengths only within parts of a recording of this duration [s], because
 #: lengths may drift from one part to the next
@@ -37,9 +38,9 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
     arm moves. Muscles that are isolated at any time during the recording are left out of the
     comparison.
 
-    On a symmetric arm, angles with the wrong sign look like exchanged muscles. If faults of joint
-    sensors and of muscles could explain the lengths, only those of the joint sensors are reported,
-    unless those of the muscles explain the lengths clearly better (`wiring.BETTER`).
+    On a symmetric arm, angles with the wrong sign look like exchanged muscles. Joint sensors are
+    reported if correcting them explains all lengths, and not clearly worse (`wiring.BETTER`) than
+    exchanged muscles do; the text then names these as well. Otherwise, muscles are reported.
 
     Args:
         robot: The geometric model.
@@ -57,18 +58,20 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
     inside = theta.clip(robot.lower, robot.upper)
     muscles = judge(robot.muscle_lengths, inside, length, tension, used=used)
     faults = joint_sensors.judge(robot, theta, length, tension, used, segments).faults
+    texts = [_text(robot, fault) for fault in faults]
     if muscles.is_faulty:
-        # Compare it with the misfit of the muscles as they are, at the corrected angles.
         meant = joint_sensors.corrected(theta, faults, robot.units).clip(robot.lower, robot.upper)
-        (square,) = square_misfits(robot.muscle_lengths, meant, length, tension)
-        misfit = np.sqrt(square.diagonal()[used].sum())
-        if not faults or misfit > BETTER * muscles.misfit:
+        corrected = judge(robot.muscle_lengths, meant, length, tension, used=used)
+        if corrected.is_faulty or corrected.misfit > BETTER * muscles.misfit:
             return RecordedFaults(muscles.wiring, [])
+        texts[-1] += f'. If the angles are right, {muscles.wiring.text(robot.muscles)}'
     if not at_rest:
-        faults += joint_sensors.stuck_sensors(robot, time, theta, length, tension, used)
-    texts = []
-    for fault in faults:
-        names = ', '.join(robot.joints[j] for j in fault.joints)
-        problem = PROBLEMS[fault.kind].filled(names=names, begin=fault.begin, end=fault.end)
-        texts.append(f'{problem.text}. {problem.remedy}')
+        stuck = joint_sensors.stuck_sensors(robot, time, theta, length, tension, used)
+        texts += [_text(robot, fault) for fault in stuck]
     return RecordedFaults(straight, texts)
+
+
+def _text(robot: Robot, fault: JointFault) -> str:
+    names = ', '.join(robot.joints[j] for j in fault.joints)
+    problem = PROBLEMS[fault.kind].filled(names=names, begin=fault.begin, end=fault.end)
+    return f'{problem.text}. {problem.remedy}'

@@ -4,7 +4,7 @@
 For each message, the estimator calls the methods of all detectors (`Detector`) in this order:
 
     read          every message of a legal shape, also without a network, and if it is rejected
-    step          a message for which there is an estimate
+    step          a message for which there is an estimate, at most one in 6 ms (SPACING)
     step_healthy  the same message, unless there is an anomaly or a length offset is unknown
 """
 
@@ -128,7 +128,8 @@ class Detector:
         """Check the readings of a message, even of a rejected one; return a finding or None.
 
         Args:
-            readings: The readings as the sensors measured them; NaN where they are unknown.
+            readings: The readings of the sensors. Values of isolated muscles, and tensions of a
+                robot that does not measure them, have no meaning and may be NaN.
             usable: Whether each muscle is used, (M,).
             now: Time of the message on a steady clock [s].
         """

@@ -94,7 +94,7 @@ class HealthMonitor:
         """Check a message for which there is an estimate; return the first finding or None.
 
         A jump of lengths takes precedence. If a fault of the driver explains the finding
-        (`exchange`), it is reported instead.
+        (`exchanged_muscles`), it is reported instead.
         """
         findings = [detector.step(observation) for detector in self._detectors]
         if (jumped := observation.sample.jumped) and observation.lengths_known:

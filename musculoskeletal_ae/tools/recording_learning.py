@@ -254,7 +254,7 @@ def _check_range(robot: Robot, source: TableSource) -> None:
 
 
 def _warnings(robot: Robot, sources: list[TableSource], is_csv: bool) -> Iterator[str]:
-    """Yield warnings about the joint sensors and, if learned from, the columns of muscles."""
+    """Yield warnings about the joint sensors and the columns of muscles."""
     if is_csv:
         remedy = (
             '. Correct the columns with --columns, and signs with a negative number as unit: '
@@ -266,7 +266,7 @@ def _warnings(robot: Robot, sources: list[TableSource], is_csv: bool) -> Iterato
         wiring, texts = find_faults(robot, source.table.rows, source.table.at_rest)
         for text in texts:
             yield f'{source.name}: {text}'
-        if wiring.faulty and not source.is_held_out:
+        if wiring.faulty:
             yield f'{source.name}: {wiring.text(robot.muscles)}{remedy}'
 
 
