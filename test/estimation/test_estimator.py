@@ -17,6 +17,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.finding import Detector
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.reading_limits import LIMITS
@@ -241,6 +242,49 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
         isolates(now + 0.01 * n)
     assert core.body.isolated == (2,)
     assert not core.cause  # missing numbers need no verification, so the arm does not stop
+
+
+def test_several_muscles_without_numbers_isolate_none_because_their_sensors_may_be_sound(
+    robot, mae, healthy
+):
+    core = Estimator(robot)
+    core.suspects.isolates = True
+    core.use(mae)
+    broken = message_of(np.where(np.isin(np.arange(6), (2, 4)), np.nan, states(healthy)))
+    for now in np.arange(0.0, 3.0 * SILENT, DT):
+        with pytest.raises(RejectionError, match='not finite'):
+            core.take(broken, now, now)
+    assert core.body.isolated == ()
+
+
+def test_rejected_muscle_states_are_reported_until_the_first_that_is_used(stepped, healthy):
+    def reported():
+        conditions = stepped.core.conditions(stepped.now)
+        return 'readings_rejected' in [each.identifier for each in conditions]
+
+    broken = healthy._replace(tension=np.full(6, 9e3))
+    stepped.step(healthy)
+    for _ in range(round(2.0 * LIMITS.glitch / DT)):
+        with pytest.raises(RejectionError):
+            stepped.step(broken)
+    assert reported()
+    stepped.step(healthy)
+    assert not reported()
+
+
+def test_tendon_friction_that_the_network_has_learned_is_removed_from_the_tensions(
+    robot, mae, healthy
+):
+    friction = np.full(6, 0.1)
+    learned = TouchStatistics(friction, np.ones(robot.joint_count))
+    stepped = EstimatorBench(robot, replace(mae, touch=learned))
+    for _ in range(100):  # every tendon is wound in
+        healthy = healthy._replace(length=healthy.length - 1e-4)
+        (output,) = stepped.step(healthy)
+    bone = np.exp(-friction) * healthy.tension
+    np.testing.assert_allclose(output.sample.bone_tension, bone, rtol=1e-3)
+    expected = mae.estimate(bone, healthy.length)
+    np.testing.assert_allclose(output.state.theta, expected.theta, atol=1e-3)
 
 
 def test_a_new_entry_in_the_list_of_detectors_warns_of_rejected_readings_until_a_reset(

@@ -72,6 +72,11 @@ def test_verification_recognises_the_fault_by_the_response_to_winding_in(
     assert verdict(tension, length, likely).outcome is expected
 
 
+def test_the_verdict_states_the_offset_of_a_length_sensor_in_millimetres():
+    off = verdict(lambda _, shake: BIAS + shake, lambda _, stir: 0.05 + stir)
+    assert str(off) == 'its length sensor has an offset of 50 mm'
+
+
 def test_a_suspect_that_is_not_wound_in_stays_isolated():
     watched = Verification(BIAS, STIFFNESS)
     answers = [watched.step(0.0, 0.0, None, 0.0, DT) for _ in range(round(PATIENCE / DT) + 5)]

@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.residuals import anomaly, residuals
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
@@ -83,6 +83,19 @@ def test_the_statistics_are_those_of_the_remaining_muscles(trained):
     np.linalg.cholesky(reduced.anomaly.covariance)
     assert reduced.anomaly.calibrated
     assert not reduced.without(()).anomaly.calibrated  # the restored muscle has no statistics
+
+
+@pytest.mark.parametrize('reads_zero', [True, False])
+def test_tension_and_length_of_a_lost_muscle_do_not_count_in_the_distance(reads_zero):
+    rng, lost = np.random.default_rng(0), (1, 3)
+    healthy, error = rng.normal(0.02, 0.01, (2, 50, 12)) @ rng.normal(size=(12, 12))
+    kept = [m for m in range(12) if m % 6 not in lost]
+    expected = AnomalyStatistics.of(healthy[:, kept], calibrated=True).distances(error[:, kept])
+    statistics = AnomalyStatistics.of(healthy, calibrated=True)
+    if reads_zero:  # as the residuals of isolated muscles
+        error.reshape(50, 2, 6)[..., lost] = 0.0
+    reduced = statistics.without(lost) if reads_zero else statistics.ignoring(lost)
+    np.testing.assert_allclose(reduced.distances(error), expected, rtol=1e-2)
 
 
 def test_a_checkpoint_stores_the_isolated_muscles(trained):

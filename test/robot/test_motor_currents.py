@@ -79,6 +79,7 @@ def test_scale_offset_and_drive_friction_are_removed_by_the_direction_of_motion(
             sample = stream.take(reading(states), (n + 100.0 * (way < 0.0)) * PERIOD)
         np.testing.assert_allclose(sample.tension_read, read)
         np.testing.assert_allclose(sample.motor_tension, pull, rtol=1e-2)
+        np.testing.assert_allclose(sample.newest.tension, pull, rtol=1e-2)
         np.testing.assert_allclose(sample.bone_tension, pull * np.exp(-0.1 * way), rtol=1e-2)
     np.testing.assert_allclose(transmission.reading(np.full(COUNT, pull), -np.ones(COUNT)), read)
 

@@ -10,7 +10,7 @@ from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.heat import AIR, HELD, LEARNED, MOMENT, RATIO, Heat, flow
+from musculoskeletal_ae.signals.heat import AIR, HELD, LEARNED, MOMENT, RATIO, Heat, flow, soon
 
 ROBOT = Robot.load('arm26')
 COUNT, TENSION = ROBOT.muscle_count, ROBOT.tension
@@ -162,6 +162,19 @@ def test_the_predicted_rest_is_as_long_as_the_motors_need():
     motors.run(predicted[hottest] + 60.0, TENSION.bias)
     assert motors.arm.winding[hottest] < highest + 3.0
     assert motors.heat.rest_needed(highest + 60.0, TENSION.bias)[hottest] == 0.0
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'text'),
+    [
+        (0.0, 'now'),
+        (30.0, 'in about 1 min'),
+        (90.0, 'in about 2 min'),
+        (np.inf, 'in more than 60 min'),
+    ],
+)
+def test_a_rest_is_stated_in_minutes_and_never_as_shorter_than_it_is(seconds, text):
+    assert soon(seconds) == text
 
 
 def test_cool_muscles_are_not_limited_and_short_pulls_may_be_stronger_than_long_ones():

@@ -235,6 +235,13 @@ def test_hot_readings_that_arrive_apart_but_were_sent_together_are_not_believed(
         assert not sample.temperature[0] > 100.0
 
 
+def test_a_hot_glitch_is_not_believed_however_long_the_arm_has_operated():
+    stream = MuscleStream(ROBOT)
+    for n, degrees in enumerate((*np.full(100, 30.0), 199.0)):
+        sample = stream.take(reading(resting(temperature=(0, degrees))), 0.1 * n)
+    assert sample.temperature[0] == 30.0
+
+
 def jumps_of_a_restarting_module(pause, boots=0.5):
     """Return the muscles reported as jumping if module 1 restarts and then reads l = 0.
 

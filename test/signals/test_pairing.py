@@ -33,6 +33,14 @@ def test_a_clock_that_jumps_back_restarts_the_pairing():
     assert after.theta == [2.0]
 
 
+def test_an_angle_that_shows_first_that_the_clock_jumped_back_is_paired():
+    pairing = Pairing(0.01)
+    pairing.joints(1.7e9, np.array([1.0]))
+    pairing.joints(0.0, np.array([2.0]))
+    assert pairing.muscles(0.001, 'message') is None
+    assert pairing.muscles(0.011, 'message').theta == [2.0]
+
+
 def paired_live(joints, muscles, period):
     """Return the index of the joint message that is paired with each muscle message, or None.
 

@@ -74,6 +74,11 @@ def test_muscles_of_equal_moment_arms_are_called_undetermined():
     texts = {wiring.text('abcdef') for wiring in found.alternatives}
     expected = {f'the readings of a and {other} are exchanged' for other in 'bc'}
     assert texts <= expected and found.is_faulty
+    # If the readings of muscle 0 are in both columns 1 and 2, either of the two may be exchanged.
+    into = [2, 0, 0, 3, 4, 5]
+    found = judge(lengths, theta, exact[:, into], tension[:, into], signs=False)
+    assert {wiring.text('abcdef') for wiring in found.alternatives} == expected
+    assert found.text('abcdef').endswith('(undetermined)')
     # Exchanging the equal muscles themselves changes nothing, so no fault is reported.
     assert not judge(lengths, theta, exact[:, [0, 2, 1, 3, 4, 5]], tension).is_faulty
 
