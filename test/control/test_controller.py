@@ -97,6 +97,17 @@ def test_second_runs_after_first_and_reads_the_tension_once():
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted + 0.01, atol=1e-9)
 
 
+def test_second_runs_after_first_even_if_the_rate_limit_makes_first_take_longer():
+    bench = Bench(method='second', first_duration=0.1, second_duration=0.1, rate_limit=0.02)
+    near = REST + 0.1
+    bench.target(near)
+    bench.step(30)  # the arm is still on its way
+    bench.tension = np.full(ROBOT.muscle_count, 80.0)
+    done = bench.step(300)[-1].value
+    wanted = ROBOT.muscle_lengths(near, bench.tension) - 50.0 / ROBOT.stiffness
+    np.testing.assert_allclose(done, wanted, atol=1e-9)
+
+
 def test_method_first_plans_with_the_tension_bias():
     bench = Bench(method='first', first_duration=1.0)
     bench.target(REST)
@@ -159,6 +170,17 @@ def test_stale_sensor_data_stop_the_arm_and_a_reset_is_refused_while_they_are_st
     assert bench.cause
     assert bench.core.reset(bench.now) is None
     assert bench.cause == ''
+
+
+def test_an_estimate_that_is_only_repeated_becomes_stale():
+    bench = Bench(max_age=0.2)
+    bench.target(REST)
+    bench.step(50)
+    bench.blind = {'estimate'}
+    for _ in range(25):
+        bench.core.estimated(bench.theta, bench.now, is_new=False)
+        bench.step()
+    assert bench.cause == 'stale_estimate'
 
 
 def test_an_anomaly_stops_the_arm_even_before_the_first_command():

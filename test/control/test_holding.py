@@ -49,6 +49,13 @@ def test_an_arm_that_is_carried_away_from_where_it_rested_is_reported():
     assert bench.report().message == 'holding'
 
 
+def test_an_arm_may_rest_further_from_its_target_than_it_did_after_an_earlier_motion():
+    bench = resting(np.array([0.0, 0.01]), target_duration=0.2)
+    bench.target(REST + np.array([0.0, 1.4 * CARRIED]))
+    bench.step(round(2.0 * LASTING / SELDOM))
+    assert bench.report().message == 'holding'
+
+
 def test_friction_and_wanted_torques_are_no_reason_to_warn():
     bench = resting(np.array([0.0, 0.9 * AWAY]), target_duration=0.2)
     bench.step(round(1.2 * LASTING / SELDOM))

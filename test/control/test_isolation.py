@@ -567,6 +567,17 @@ def test_a_requested_stop_outlasts_a_verification(first):
     assert bench.core.reset(bench.now) is None
 
 
+@pytest.mark.parametrize('is_winding', [True, False])
+def test_no_suspect_is_wound_in_after_an_operator_has_stopped_the_arm(is_winding):
+    bench = VerificationBench()
+    start = round((bench.core.settings.hold_time + PAYING_OUT) / 0.01)
+    bench.step(start + 3 if is_winding else 50)
+    bench.stop()
+    lengths = values([bench.core.limiter.command, *bench.step(start)])
+    assert bench.core.supervisor.mode == 'verifying'
+    assert np.diff(lengths, axis=0).min() >= 0.0
+
+
 def test_the_end_of_an_anomaly_without_a_suspect_does_not_end_the_stop():
     bench = Bench()
     bench.target(REST)

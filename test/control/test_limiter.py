@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every published command is finite, and within the limits of rate and tension."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from control_bench import sample
@@ -72,6 +74,20 @@ def test_the_lead_of_a_winding_muscle_demands_more_only_while_its_tension_is_bel
     np.testing.assert_allclose(demanded(BIAS, 0.0), limit)
     np.testing.assert_allclose(demanded(BIAS, lead), limit + ROBOT.stiffness * lead)
     assert (demanded(limit + 1.0, lead) <= limit).all()
+
+
+@pytest.mark.parametrize(('spread', 'lower'), [(15.0, 30.0), (1e3, np.inf)])
+@pytest.mark.parametrize('kind', [LENGTH, TENSION])
+def test_an_uncertain_tension_lowers_its_limit_by_two_spreads_but_not_below_the_bias(
+    kind, spread, lower
+):
+    limiter = CommandLimiter(Setup(ROBOT, Settings(rate_limit=1.0)))
+    now = replace(sample(0.0, BIAS), tension_spread=spread)
+    desired = Command(kind, np.full(COUNT, -1.0 if kind == LENGTH else MAX))
+    for _ in range(10):  # long enough for the rate limit
+        sent = limiter.limit(desired, now, LIMIT, DT).value
+    demanded = sent if kind == TENSION else BIAS + ROBOT.stiffness * -sent
+    np.testing.assert_allclose(demanded, np.maximum(ROBOT.tension.limit - lower, BIAS))
 
 
 def test_the_tension_of_a_restored_muscle_rises_at_the_rate_limit():

@@ -71,6 +71,12 @@ def test_a_push_on_the_hand_is_another_load_until_the_next_motion():
     assert not arm.check.has_changed
 
 
+def test_a_changed_load_is_reported_for_as_long_as_it_remains():
+    arm = Resting()
+    assert not arm.rest() and arm.rest(180.0)
+    assert arm.rest(180.0, seconds=90.0)
+
+
 def test_a_payload_may_be_picked_up_and_put_down():
     arm = Resting()
     for mass in 0.0, 3.0:

@@ -19,6 +19,7 @@ from musculoskeletal_ae.control.controller import WINDOW
 from musculoskeletal_ae.control.supervisor import RESUME
 from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, Overload
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.signals.body_state import Trust
 from musculoskeletal_ae.signals.muscle_states import QUANTITIES
 from musculoskeletal_ae.signals.reading_limits import LIMITS
@@ -204,6 +205,15 @@ def test_a_tension_that_stays_above_its_limit_releases_the_arm():
     assert bench.core.reset(bench.now) is None
 
 
+def test_an_overload_lasts_although_some_messages_contain_impossible_tensions():
+    bench = distorting()
+    bench.pull(250.0)
+    for _ in range(4):
+        bench.step(5)
+        bench.lies(3, tension=lambda row: row + 600.0)
+    assert bench.cause == 'overload'
+
+
 @pytest.mark.parametrize(
     ('peak', 'is_overload'),
     [
@@ -360,3 +370,16 @@ def test_during_an_anomaly_the_estimator_decides_whether_a_jump_is_due_to_a_repa
 
 def with_a_jump(length):
     return length + 0.05 * (np.arange(len(length)) == 2)
+
+
+@pytest.mark.parametrize('method', ['proposed', 'tension'])
+def test_after_a_pause_of_a_stopped_controller_no_muscle_is_pulled_harder(method):
+    bench = distorting(method=method)
+    bench.stop()
+    before = bench.step(20)[-1]
+    bench.now += 2.0
+    bench.tension = np.full(ROBOT.muscle_count, 150.0)  # somebody has moved the arm meanwhile
+    sent = [command for command in bench.step(100) if command is not None]
+    assert {command.kind for command in sent} == {before.kind}
+    harder = before.value - values(sent)
+    assert (harder if before.kind == LENGTH else -harder).max() <= 1e-9

@@ -551,6 +551,20 @@ def test_a_twist_moves_the_hand_until_it_times_out(bench):
     assert gone @ twist[:3] / 0.1 > 0.08
 
 
+def test_a_joint_that_a_twist_moves_to_its_limit_stops_there_and_the_others_go_on():
+    bench, begun = Bench(), np.array([REST[0], ROBOT.upper[1] - 0.02])
+    bench.theta = begun
+    bench.step()
+    twist = np.zeros(6)
+    twist[:3] = ROBOT.kinematics.end_effector_jacobian(begun)[:3] @ np.array([0.3, 0.6])
+    bench.core.twist(twist)
+    trajectory = bench.follower.progress.trajectory
+    _, theta = trajectory.path
+    np.testing.assert_allclose(trajectory.end[1], ROBOT.upper[1])
+    assert theta[:, 1].max() <= ROBOT.upper[1] + 1e-9
+    assert theta[-1, 0] - begun[0] > 0.05
+
+
 @pytest.mark.parametrize('apart', [1e-9, 1e-6])
 def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apart):
     goals = np.stack([np.array(REST), np.array(OTHER)])

@@ -165,3 +165,10 @@ def test_stopping_comes_to_rest_from_any_motion_within_the_limits():
         np.testing.assert_allclose(part, expected, atol=1e-9)
     assert (trajectory.end <= ROBOT.upper).all()
     assert not trajectory.sample(trajectory.duration).velocity.any()
+
+
+def test_a_motion_that_comes_to_rest_only_gets_slower():
+    start = Setpoint(MIDDLE, np.array([0.6, -0.4]), np.zeros(2))
+    trajectory = Trajectory.stopping(start, ROBOT)
+    speed = np.abs(trajectory.sample(np.linspace(0.0, trajectory.duration, 50)).velocity)
+    assert (np.diff(speed, axis=0) <= 1e-9).all()
