@@ -356,6 +356,19 @@ def test_a_topic_that_was_lost_during_the_recording_is_a_fault(topic, robot, tmp
     assert f'no message of {topic} was recorded from 4.0 s to 15.0 s' in fault
 
 
+def test_a_pause_of_the_recorder_is_not_blamed_on_the_publishers(robot, tmp_path):
+    arm, pause = Arm(robot, count=400, late=0.0), 60 * 10**9
+    late = samples.START + 2 * 10**9
+    arm.content = [
+        each._replace(log_time=each.log_time + pause * (each.log_time >= late))
+        for each in arm.content
+    ]
+    arm.write(tmp_path / 'bag')
+    faults = check_bag(tmp_path / 'bag', 'arm26').faults
+    assert any('the recorder was paused' in fault for fault in faults)
+    assert not any('no message of' in fault for fault in faults)
+
+
 def test_an_encoder_that_wraps_around_is_named_and_no_muscle_is_blamed(robot, tmp_path):
     arm = Arm(robot, count=400)
     theta = iter(np.mod(arm.theta, 2.0 * np.pi))

@@ -93,6 +93,10 @@ def test_messages_are_ordered_by_time_whatever_order_they_came_in(tmp_path):
             writer.flush()
     read = [message.log_time for message in Bag.open(tmp_path / 'bag').messages()]
     assert read == sorted(read) == list(range(1, 10))
+    # In the file itself, the messages of each flush are ordered.
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
+        messages = make_reader(file).iter_messages(log_time_order=False)
+        assert [message.log_time for _, _, message in messages] == [3, 5, 9, 2, 4, 7, 1, 6, 8]
 
 
 def test_a_directory_that_is_not_empty_is_refused(bag):

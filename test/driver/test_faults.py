@@ -1012,6 +1012,7 @@ def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
 POSITION_FAULTS = {
     'deaf': ('take', lambda _: np.zeros(M), 'position hold'),
     'sign of the command': ('take', lambda target: -target - 0.04, 'position ran away'),
+    'another zero, which pays out': ('take', lambda target: target + 0.06, 'position ran away'),
     'exchanged commands': ('take', exchanged, 'misplaced commands'),
     'half of the way': ('take', 'half', 'position gain'),
     'sign of T': ('publish', 'fall', 'position sign'),
@@ -1032,6 +1033,13 @@ def test_each_fault_of_a_driver_that_follows_positions_is_detected(fault):
     setattr(driver, where, value)
     verdict = driver.wind((BICEPS,))
     assert what in {fault.kind for fault in verdict.faults}, str(verdict)
+
+
+def test_the_latency_is_stated_in_milliseconds():
+    driver = settled()
+    driver.late = 0.15
+    (late,) = re.findall(r'the first change came (\d+) ms', str(driver.wind((BICEPS,))))
+    assert 100 < int(late) < 300
 
 
 def test_an_optional_quantity_is_judged_by_its_entry_in_the_table(monkeypatch):

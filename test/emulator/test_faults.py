@@ -72,6 +72,18 @@ def test_a_frozen_sensor_stays_frozen_when_another_fault_is_added(arm, robot):
     assert after[MUSCLE] == before and after[MUSCLE + 1] > before + 50.0
 
 
+def test_a_drift_goes_on_when_another_fault_is_added(robot):
+    faults, readings = Faults(robot, np.random.default_rng(0)), numbered(robot, 0)
+    drift = 'drift:length:0.01'
+    for lines in ([drift], [drift, 'bias:tension']):
+        faults.set(lines)
+        faults.pass_time(1.0)
+    np.testing.assert_allclose(faults.apply(readings).muscles.length, 0.02)
+    faults.set([])
+    faults.set([drift])  # a drift that begins again starts from 0
+    np.testing.assert_allclose(faults.apply(readings).muscles.length, 0.0)
+
+
 def sensed(arm, line, count=300):
     """Return the readings of N messages with a fault, (N, M) of each quantity."""
     arm.faults.set([line])

@@ -316,6 +316,12 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
     assert any('muscle still: it moves no joint' in note for note in result.source.notes)
 
 
+def test_a_cardsflow_cylinder_has_the_axis_z_of_its_link(cardsflow, tmp_path):
+    cardsflow.write_text(bodies.CARDSFLOW.replace('SPHERICAL', 'CYLINDRICAL'))
+    _, wrap, _ = import_robot(cardsflow, tmp_path / 'out').robot.description.routes[1]
+    np.testing.assert_allclose(wrap.axis, [0.0, 0.0, 1.0], atol=1e-9)
+
+
 def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     text = re.sub(r' rpy="[^"]*"', '', (tmp_path / 'model.urdf').read_text())
     endless = text.replace('lower="-1" upper="1"', 'lower="-1e16" upper="1e16"', 1)

@@ -52,6 +52,17 @@ def test_isolated_muscles_are_left_out_of_samples_and_of_the_next_update(
     again.close()
 
 
+def test_an_update_follows_when_muscles_are_isolated_or_restored(arm26, initial, stage):
+    learner = Learner(arm26, initial, trainer=IdleTrainer)
+    for _ in range(3):
+        learner.accept(stage.sample())
+    changes = [(), (), (LOST,), (LOST,), ()]
+    for number, isolated in enumerate(changes):
+        learner.use_body(learner.body.with_isolated(isolated))
+        learner.poll(10.0 * number)
+    assert [job.isolated for job in learner.trainer.jobs] == [(), (LOST,), ()]
+
+
 def test_a_restarted_learner_isolates_nothing_and_keeps_its_network_as_it_was(
     arm26, initial, tmp_path
 ):

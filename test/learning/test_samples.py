@@ -147,6 +147,17 @@ def test_a_full_store_keeps_the_newest_and_its_coverage():
     assert store.accepted == 504
 
 
+def test_samples_that_were_held_back_return_to_their_places():
+    store = SampleStore()
+    store.offset = np.zeros(1)
+    for number in range(3):
+        store.add(at(number, 0.0), time=10.0 * number)
+    store.hold(12.0)
+    assert [sample.theta[0] for sample in store.samples] == [0.0, 2.0]
+    store.use_offset(np.zeros(1))
+    assert [sample.theta[0] for sample in store.samples] == [0.0, 1.0, 2.0]
+
+
 class Messages:
     """Sends messages of an arm to a collector, on a simulated clock."""
 

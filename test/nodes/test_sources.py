@@ -2,6 +2,7 @@
 """Second publishers are detected from the graph, from reports and from stamps."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
@@ -24,6 +26,7 @@ from musculoskeletal_ae.ros.second_publishers import (
     UNNAMED,
     Authorship,
     Publisher,
+    Sources,
     Twins,
     full_name,
 )
@@ -61,6 +64,26 @@ def test_a_publisher_without_a_name_is_waited_for_and_then_an_intruder():
     assert (early.intruders, early.is_certain) == ('', False)
     late = looked(unnamed, (0, 0), (0.0, NAMING)).intruders
     assert late == '/estimator and a node that has not announced its name yet'
+
+
+def test_a_latched_topic_is_subscribed_again_once_it_has_one_publisher():
+    own = SimpleNamespace(node_namespace='/', node_name='estimator', endpoint_gid=b'1')
+    other = SimpleNamespace(node_namespace='/', node_name='stranger', endpoint_gid=b'2')
+    present, renewed = [own, other], []
+    node = SimpleNamespace(
+        count_publishers=lambda _: len(present),
+        get_publishers_info_by_topic=lambda _: present,
+    )
+    sources = Sources(node, resolve=str, turns=lambda _: 0, renew=renewed.append)
+    sources.watch('body_state')
+    with pytest.raises(MessageError, match='several publishers'):
+        sources.check('body_state', is_latched=True)
+    sources.look()
+    assert renewed == []
+    present.remove(other)
+    for _ in range(2):
+        sources.look()
+    assert renewed == ['body_state']
 
 
 def report(node, identity):

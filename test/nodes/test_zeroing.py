@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from graph import DEADLINE
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.estimation.lengths import length_calibration
@@ -11,6 +12,7 @@ from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
+from musculoskeletal_ae.ros.message_building import array_message
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 
 
@@ -85,6 +87,19 @@ def test_every_decision_of_the_estimator_is_used_once_and_as_it_states(graph, tr
     reported(5, 0.05, 1e-3, Trust.KNOWN)
     reported(6, 0.05, 1e-2, Trust.KNOWN)  # the estimator has confirmed the offsets
     assert uses == [2, 1, 3, 4, 5, 6]
+
+
+def test_commanded_lengths_are_corrected_by_the_same_offsets_as_measured_ones(graph, monkeypatch):
+    core, noted = graph.host(EstimatorNode, robot='arm26').core, []
+    monkeypatch.setattr(core, 'commanded', lambda _, length: noted.append(length))
+    core.body = core.body.with_offsets(LengthOffsets(np.full(6, 0.05), np.full(6, 1e-3)))
+    publisher = graph.publisher(Float64MultiArray, 'muscle_length_command')
+
+    def is_noted():
+        publisher.publish(array_message(np.full(6, 0.02), 'muscle'))
+        return noted
+
+    np.testing.assert_allclose(graph.wait(is_noted, 'the command')[0], -0.03)
 
 
 def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, trained_file):

@@ -182,6 +182,13 @@ def test_a_joint_forced_beyond_its_limits_stops_there_and_is_reported(robot, bod
     assert robot.joints[0] in arms.limits()
 
 
+def test_the_limits_of_each_arm_are_its_own(robot, body):
+    arms = Simulation(robot, body, arms=2)
+    arms.fixed[1, 0] = 9.0
+    assert robot.joints[0] not in arms.limits(0)
+    assert robot.joints[0] in arms.limits(1)
+
+
 def test_speeds_stay_limited_when_the_command_jumps(robot, body, commands):
     arms = settled(robot, body, commands)
     arms.command = commands[::-1]
