@@ -161,12 +161,13 @@ def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) ->
         topics: Recorded names of the topics, by name in the interface.
         times: Log times [ns] of each topic, by recorded name.
     """
-    paused = {pause.begin for pause in find_pauses(times.values())}
+    pauses = find_pauses(times.values())
     faults = []
     for name in dict.fromkeys(topics[each] for each in READINGS if each in topics):
         marks = np.unique([bag.start, *times[name], bag.end])
         for begin, end in zip(marks[:-1].tolist(), marks[1:].tolist()):
-            if end - begin > LONGEST_PAUSE and begin not in paused:
+            paused = sum(p.end - p.begin for p in pauses if begin <= p.begin and p.end <= end)
+            if end - begin - paused > LONGEST_PAUSE:
                 since, until = ((mark - bag.start) / 1e9 for mark in (begin, end))
                 faults.append(
                     f'no message of {name} was recorded from {since:.1f} s to {until:.1f} s after '

@@ -357,7 +357,7 @@ def test_a_topic_that_was_lost_during_the_recording_is_a_fault(topic, robot, tmp
 
 
 def test_a_pause_of_the_recorder_is_not_blamed_on_the_publishers(robot, tmp_path):
-    arm, pause = Arm(robot, count=400, late=0.0), 60 * 10**9
+    arm, pause = Arm(robot, count=400), 60 * 10**9
     late = samples.START + 2 * 10**9
     arm.content = [
         each._replace(log_time=each.log_time + pause * (each.log_time >= late))
