@@ -16,7 +16,7 @@ is the misfit of column j to muscle k (`square_misfits`). f are the lengths of a
 the geometric model or a network. The variance is taken within each segment of the recording, so
 length offsets do not matter. Two columns count as exchanged if exchanging them divides their summed
 e² by at least BETTER². A column counts as having the wrong sign if reversing the sign does so, and
-several columns count as exchanged in a cycle if the best order of all does so (`judge`).
+several columns count as exchanged in a cycle if several exchanges together do so (`judge`).
 
 Unknown posture. The caller states the cost of the readings as they are, and the cost under each of
 the wirings that differ by one fault (`single_faults`). Two cases use this: the fit of a length
@@ -38,7 +38,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 
@@ -239,26 +238,22 @@ def judge(
         others = [other for other in single_faults(wiring, columns, signs) if is_equal(other)]
         alternatives = (best, *(other for other in others if other != best))
         wiring = best
-    # No single exchange may improve a cycle of columns: then correct all columns at once.
-    best = _assigned(square, columns)
-    if gain(best) > 0.0:
-        wiring, alternatives = best, (best,)
+    # In a cycle of columns, no single exchange may be clearly better, but all of them together are.
+    cycle, least = wiring, misfit(wiring, columns)
+    while True:
+        exchanged = (cycle, *single_faults(cycle, columns, signs=False))
+        cost, better = min((misfit(each, columns), each) for each in exchanged)
+        if not cost < least:  # also true if a reading is missing
+            break
+        cycle, least = better, cost
+    if gain(cycle) > 0.0:
+        wiring, alternatives = cycle, (cycle,)
     unclear = set[int]()
     for j, k in combinations(columns.tolist(), 2):
         if misfit(wiring.exchanged(j, k), (j, k)) < BETTER**2 * misfit(wiring, (j, k)):
             unclear |= {j, k}
     right = tuple(j for j in columns.tolist() if j not in unclear and j not in wiring.faulty)
     return WiringJudgement(wiring, alternatives, right, np.sqrt(misfit(wiring, columns.tolist())))
-
-
-def _assigned(square: Array, columns: Ints) -> Wiring:
-    """Return the wiring of these columns with the least misfit, (1 or 2, M, M), of all wirings."""
-    reverses = square[0] > BETTER**2 * square[-1]
-    cost = np.where(reverses, square[-1], square[0])[np.ix_(columns, columns)]
-    order, sign = np.arange(len(reverses)), np.ones(len(reverses), dtype=int)
-    order[columns] = columns[linear_sum_assignment(cost)[1]]
-    sign[columns] -= 2 * reverses[columns, order[columns]]
-    return Wiring(tuple(order.tolist()), tuple(sign.tolist()))
 
 
 def square_misfits(
