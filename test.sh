@@ -36,7 +36,8 @@ export ROS_LOG_DIR=$repository/log/test
 export OMP_NUM_THREADS=1
 
 say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"
-# Fast DDS may block forever while a node is destroyed or another one disappears (eProsima/Fast-DDS
-# 6193, 6502). If the process of a test ended in this way (pyproject.toml) or crashed, the test is run
-# once more and reported as RERUN. A test that failed is not repeated: no failure matches the pattern.
+# Fast DDS may block a process of pytest forever while a node is destroyed or another one disappears
+# (eProsima/Fast-DDS 6193, 6502). The process then ends after faulthandler_timeout (pyproject.toml).
+# Its test is run once more and reported as RERUN, as after a crash. A test that failed is not run
+# again, because no failure matches the pattern (?!).
 exec "$python" -m pytest -n 4 --dist worksteal --reruns 1 --only-rerun '(?!)' "$@"

@@ -18,10 +18,9 @@ class Problem(Strict, frozen=True, array_like=True):
     """A fault or a warning that a tool reports, with its remedy."""
 
     text: str  # what was observed
-    remedy: str  # what to do; '' if `holding_remedies` computes it for each arm
+    remedy: str  # what to do; '' if the tool computes it
     check: str = ''  # the check that finds it, if the tool has several checks
-    #: what is affected: names of muscles of a driver, or other subjects that the table states; for
-    #: 'not_held' and 'not_stiff', the name of the joint that is most often the weakest
+    #: names of what is affected, such as muscles: stated by the table, or by the tool (`filled`)
     subjects: tuple[str, ...] = ()
     kind: str = ''  # an identifier, such as 'wrong_sign'
 

@@ -166,7 +166,8 @@ def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) ->
     for name in dict.fromkeys(topics[each] for each in READINGS if each in topics):
         marks = np.unique([bag.start, *times[name], bag.end])
         for begin, end in zip(marks[:-1].tolist(), marks[1:].tolist()):
-            paused = sum(p.end - p.begin for p in pauses if begin <= p.begin and p.end <= end)
+            within = [each for each in pauses if begin <= each.begin and each.end <= end]
+            paused = sum(pause.end - pause.begin for pause in within)
             if end - begin - paused > LONGEST_PAUSE:
                 since, until = ((mark - bag.start) / 1e9 for mark in (begin, end))
                 faults.append(

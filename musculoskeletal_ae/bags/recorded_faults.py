@@ -58,6 +58,8 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
     inside = theta.clip(robot.lower, robot.upper)
     muscles = judge(robot.muscle_lengths, inside, length, tension, used=used)
     faults = joint_sensors.judge(robot, theta, length, tension, used, segments).faults
+    if muscles.is_faulty and not faults:
+        return RecordedFaults(muscles.wiring, [])
     texts = [_text(robot, fault) for fault in faults]
     if muscles.is_faulty:
         meant = joint_sensors.corrected(theta, faults, robot.units).clip(robot.lower, robot.upper)

@@ -295,9 +295,9 @@ def read_streams(
         stop: Latest log time [ns] of the messages to read.
 
     Raises:
-        BagError: If no message of a topic fits the robot, the bag is damaged, or `interface_topics`
-            raises an error. Also if there are no joint angles, and the recorded
-            `robot_description` is that of another robot.
+        BagError: If no message of a topic fits the robot, the bag is damaged, `interface_topics`
+            raises an error, or the recorded `robot_description` lacks joints of the robot and there
+            are no joint angles.
     """
     recorded = interface_topics(bag, namespace, robot.description.motor_topics)
     labels = _labels(recorded)

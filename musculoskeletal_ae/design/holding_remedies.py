@@ -51,6 +51,7 @@ def remedies(check: RobotCheck, fault: Problem) -> list[str]:
         fault: The fault of this check to remedy, of the kind 'not_held' or 'not_stiff'.
     """
     kind = fault.kind.removeprefix('not_')
+    # The subject of these faults is the joint that is most often the weakest.
     (weakest,) = map(check.setting.robot.joints.index, fault.subjects)
 
     @cache

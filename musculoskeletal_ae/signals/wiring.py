@@ -16,7 +16,7 @@ is the misfit of column j to muscle k (`square_misfits`). f are the lengths of a
 the geometric model or a network. The variance is taken within each segment of the recording, so
 length offsets do not matter. Two columns count as exchanged if exchanging them divides their summed
 e² by at least BETTER². A column counts as having the wrong sign if reversing the sign does so, and
-several columns count as exchanged in a cycle if several exchanges together do so (`judge`).
+several columns count as exchanged if several exchanges together do so (`judge`).
 
 Unknown posture. The caller states the cost of the readings as they are, and the cost under each of
 the wirings that differ by one fault (`single_faults`). Two cases use this: the fit of a length
@@ -238,7 +238,8 @@ def judge(
         others = [other for other in single_faults(wiring, columns, signs) if is_equal(other)]
         alternatives = (best, *(other for other in others if other != best))
         wiring = best
-    # In a cycle of columns, no single exchange may be clearly better, but all of them together are.
+    # If columns are exchanged in a cycle, no single exchange need be clearly better. Make every
+    # exchange that helps at all, and judge all of them together.
     cycle, least = wiring, misfit(wiring, columns)
     while True:
         exchanged = (cycle, *single_faults(cycle, columns, signs=False))
