@@ -17,9 +17,8 @@ torque, such as the component along a stretched arm.
 result is the residual of the momentum observer (De Luca 2005), without numerical differentiation
 of noise. Tendon friction has to be known: unknown friction hides a contact force of 10 N.
 
-At a joint limit, the unknown torque of the stop is added to τ_ext. A computed torque that points
-away from the stop may be due to the stop alone and therefore counts as 0. If the computed torque
-points towards the stop, the true τ_ext is at least as large.
+At a joint limit, the unknown torque of the stop is added to τ_ext. The τ_ext of a joint within
+AT_STOP of its limits therefore counts as 0.
 """
 
 import math
@@ -56,8 +55,8 @@ class Contact(NamedTuple):
     """External load estimated from one message.
 
     Attributes:
-        torque: External torques at the joints [N·m], (D,); 0 where the stop of a joint may be the
-            only cause.
+        torque: External torques at the joints [N·m], (D,); 0 for joints near a stop, whose torque
+            is unknown.
         force: Function that computes the force [N], (3,), which acts on the origin of the end
             effector, in the axes of the root link. It is a function because few callers need the
             force.
@@ -113,6 +112,7 @@ class ContactEstimator:
 
     Attributes:
         velocity: Filtered joint velocities θ̇ [rad/s], (D,).
+        damping: Damping of the joints in the network [N·m·s/rad], (D,).
         is_calibrated: Whether the residual torque of the healthy arm has been calibrated. Contacts
             are detected only then.
         count: Number of contacts detected so far.
@@ -134,6 +134,7 @@ class ContactEstimator:
         """
         joint_count, healthy = self._robot.joint_count, mae.touch
         self._robot = self._robot.with_elasticity(mae.elasticity)
+        self.damping = self._robot.kinematics.elasticity.damping
         self._mae = mae
         self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated last
         self._weight = np.ones(joint_count)  # 1/σ², (D,); 1 without a calibrated σ
@@ -165,8 +166,7 @@ class ContactEstimator:
         position, self.velocity = smooth[:joint_count], rate[:joint_count]
         torque = kinematics.inverse_dynamics(position, self.velocity, acceleration[:joint_count])
         torque += smooth[joint_count:]
-        from_middle = position - self._middle
-        is_free = (np.abs(from_middle) < self._reach) | (torque * from_middle > 0.0)
+        is_free = np.abs(position - self._middle) < self._reach
         torque *= is_free
         if not math.isfinite(torque @ torque):
             self.reset()

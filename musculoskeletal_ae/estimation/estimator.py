@@ -93,7 +93,8 @@ class Estimator:
         suspects: The latched fault that a detector found, and the verification of its muscle.
         calibration: The running length calibration, or None.
         contact: Estimates the external load, and detects contact.
-        healthy_torque: Measures the external torque that is wrongly estimated without contact.
+        healthy_torque: Measures joint damping, and the torque that is wrongly estimated without
+            contact.
         networks: Decides which network is used.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
@@ -128,7 +129,7 @@ class Estimator:
         self.suspects = SuspectHandling(robot)
         self.calibration: LengthCalibration | None = None
         self.contact = ContactEstimator(robot)
-        self.healthy_torque = HealthyTorque(robot.joint_count)
+        self.healthy_torque = HealthyTorque(robot)
         self.networks = CheckpointValidator(robot, self.use)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
@@ -187,7 +188,8 @@ class Estimator:
             mae: The network.
 
         Returns:
-            The network with all muscles, and with the residual torque that was measured so far.
+            The network with all muscles, and with the damping and the residual torque that were
+            measured so far.
 
         Raises:
             numpy.linalg.LinAlgError: If the network's statistics are singular; the previous network
@@ -532,7 +534,8 @@ class Estimator:
             pull = sample.bone_tension * self.body.used
             self.load = self.contact.step(estimated.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
-                self.healthy_torque.step(self.load.torque, self.contact.velocity, sent_apart)
+                contact, torque = self.contact, self.load.torque
+                self.healthy_torque.step(torque, contact.velocity, contact.damping, sent_apart)
         if known and self.suspects.finding is None:
             self.health.step_healthy(observation, self.load)
             self._follow_joint_trust()

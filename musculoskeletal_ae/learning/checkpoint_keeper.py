@@ -106,8 +106,8 @@ class CheckpointKeeper:
 
     def _publish(self, mae: Mae) -> None:
         if mae.touch is not None and not mae.touch.time:
-            # Copy the residual torque from the last network, because updates do not measure it.
-            mae = _with_torque_of(self.mae, mae)
+            # Updates do not measure damping and residual torque: copy those of the last network.
+            mae = _with_measurements_of(self.mae, mae)
         self._highest_version = max(self._highest_version, mae.version)
         self._newest, self._is_published = Packed.of(mae), False
 
@@ -142,7 +142,7 @@ class CheckpointKeeper:
         if newest is None:
             return
         if mae.version == newest.version:
-            measured = _with_torque_of(mae, newest)
+            measured = _with_measurements_of(mae, newest)
             if measured is not newest:
                 self._newest = Packed.of(measured)
             if self._saved is not self._newest:
@@ -242,11 +242,17 @@ class CheckpointKeeper:
         return values
 
 
-def _with_torque_of(measured: Mae | None, mae: Mae) -> Mae:
-    """Return `mae` with the residual torque of another network, if both have one and it differs."""
+def _with_measurements_of(measured: Mae | None, mae: Mae) -> Mae:
+    """Return `mae` with the damping and the residual torque that another network contains.
+
+    The network is returned unchanged if one of both contains no residual torque, or if they agree.
+    """
     if measured is None or measured.touch is None or mae.touch is None:
         return mae
     known = measured.touch
     if known.time == mae.touch.time and np.array_equal(known.spread, mae.touch.spread):
         return mae
-    return replace(mae, touch=replace(mae.touch, spread=known.spread, time=known.time))
+    mae = replace(mae, touch=replace(mae.touch, spread=known.spread, time=known.time))
+    if (damped := measured.elasticity) is None:
+        return mae
+    return replace(mae, elasticity=replace(mae.elasticity or damped, damping=damped.damping))

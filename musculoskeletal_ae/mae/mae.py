@@ -311,7 +311,8 @@ class Mae:
     #: how far the learned lengths may be wrong over the workspace [m], (M,), without their means
     #: (`body_model.covariance.length_spread`); None if not yet learned
     length_spread: Array | None = None
-    elasticity: JointElasticity | None = None  # springs of the joints; None if not learned
+    #: learned springs and measured damping of the joints; None if neither is known
+    elasticity: JointElasticity | None = None
     #: groups of joints and muscles, each with a block of the network; () for one block
     groups: tuple[Group, ...] = ()
     #: for each block, the index of its base, whose inputs and part of z it uses as well, as a
