@@ -57,25 +57,22 @@ class HealthyTorque:
         """Put the measured damping and residual torque σ into a copy of a network; return the copy.
 
         A network that contains no σ is returned unchanged. Before the first measurement, the values
-        of the network are adopted instead, and later measurements are averaged with them.
+        of the network are adopted instead, and later measurements are averaged with them. Damping
+        needs as much motion as the detection of contact (`TouchStatistics.calibrated`).
         """
         if (known := mae.touch) is None:
             return mae
         springs = mae.elasticity or self._stated
         if self._time == 0.0:
-            square, more = (
-                np.full_like(known.spread, SLOW**2),
-                springs.damping - self._stated.damping,
-            )
-            self._means = np.array([known.spread**2, square, -2.0 * square * more])
-            self._time = known.time
+            square = np.full_like(known.spread, SLOW**2)
+            product = -2.0 * square * (springs.damping - self._stated.damping)
+            self._means, self._time = np.array([known.spread**2, square, product]), known.time
             return mae
         spread = np.maximum(np.sqrt(self._means[0]), LEAST_SPREAD)
-        return replace(
-            mae,
-            touch=replace(known, spread=spread, time=self._time),
-            elasticity=replace(springs, damping=self.damping),
-        )
+        touch = replace(known, spread=spread, time=self._time)
+        if not touch.calibrated:
+            return replace(mae, touch=touch)
+        return replace(mae, touch=touch, elasticity=replace(springs, damping=self.damping))
 
     def step(self, torque: Array, velocity: Array, damping: Array, dt: float) -> None:
         """Update damping and residual torque with a message of the healthy arm, if the arm moves.
