@@ -25,9 +25,9 @@ tension is T_low. λ is measured while the arm moves (`winches`).
 Position-controlled modules turn without tension and only lag by λ. For them, l_comp and
 K_stiff λ dl/dt are 0.
 
-A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
-(`slowness`). The follower also holds the end of the trajectory. The rest feedback
-(`feedback.Feedback`) then continues from δ, and the plan changes only with it.
+A trajectory that is too fast for the muscle modules is slowed before it starts (`slowness`). The
+follower also holds the end of the trajectory. The rest feedback (`feedback.Feedback`) then
+continues from δ, and the plan changes only with it.
 
 Where no tension is known, T is `Actuation.assumed_tension` in every posture, as in the samples from
 which the network was learned (doc/explanation/method.md).

@@ -11,8 +11,6 @@ finds the path, and the whole way is checked, except that of `by_twist`.
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 import pinocchio as pin
 
@@ -23,7 +21,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import holdable_paths
 from musculoskeletal_ae.motion.hand import Hand
-from musculoskeletal_ae.motion.slowness import exertion_slowness, slowness
+from musculoskeletal_ae.motion.slowness import slowed_to_exert, slowness
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import distinct
 
@@ -78,10 +76,7 @@ class Planner:
         )
         path, problem = self._passable(mae, path, self.takes_nearest)
         planned = self._within_limits(mae, Trajectory.to(start, path[1:], duration))
-        slower = exertion_slowness(self._setup.robot, mae, planned, lag)
-        if slower > 1.0:
-            planned = self._within_limits(mae, planned.scaled(slower))
-        return planned, problem
+        return slowed_to_exert(self._setup.robot, mae, planned, lag), problem
 
     def through(
         self, mae: Mae, start: Setpoint, points: TrajectoryPoints, passed: float, lag: float
@@ -102,12 +97,7 @@ class Planner:
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
         self._passable(mae, planned.path[1], nearest=False)
-        slower = exertion_slowness(self._setup.robot, mae, planned, lag)
-        # Slowing changes the path of a trajectory that starts in motion. If the slowed trajectory
-        # would leave the joint limits, keep the faster one, from which the arm may then deviate.
-        with suppress(MessageError):
-            planned = self._slowed(mae, planned.scaled(slower)) if slower > 1.0 else planned
-        return planned
+        return slowed_to_exert(self._setup.robot, mae, planned, lag)
 
     def to_rest(self, start: Setpoint) -> Trajectory:
         """Plan to come to rest within `trajectory.STOPPING` seconds from the setpoint `start`."""

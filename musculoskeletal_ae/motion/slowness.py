@@ -2,15 +2,17 @@
 """Slows trajectories that are too fast for the muscle modules.
 
 Two properties of the modules limit the speed: how fast they turn (`slowness`), and how much tension
-they may exert (`exertion_slowness`).
+they may exert (`slowed_to_exert`).
 """
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.holdable_paths import NOTABLE, USED, PathLimits
-from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.motion.trajectory import Setpoint, Slowdown, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
 #: let the motion of the arm use this fraction of the rate limit of the lengths; the remaining
@@ -20,7 +22,7 @@ SHARE = 0.7
 #: each piece between two points still contains an instant, even of a trajectory of 10 000 points
 MOST_MOMENTS = 12_500
 
-#: slow a motion by the smallest of these factors with which the tensions suffice
+#: slow a motion, where necessary, by the smallest of these factors with which tensions suffice
 SLOWER = tuple(1.1**k for k in range(17))
 #: slow the motion of an arm with isolated muscles by one of these factors instead: it may fall
 #: where other arms only deviate from the trajectory, and coarse factors leave it a reserve
@@ -30,6 +32,10 @@ LEAST_LAG = 0.02
 MOMENT_SPACING = 0.06  # compute tensions at instants that are at least this motion apart [rad]
 #: compute tensions at no more instants than this; 500 instants take about 30 ms
 MOST_EXERTIONS = 500
+#: begin to slow a motion this long before the muscles would lack torque, and end this long
+#: afterwards [s]; a sudden change would itself cost torque
+EASING = 0.07
+EASING_STEP = 0.01  # state the factor at instants that are this far apart [s]
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
@@ -49,19 +55,22 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     return float(max(1.0, (np.abs(speed) / fastest).max()))
 
 
-def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) -> float:
-    """Return the factor by which to slow a motion so that the muscles can exert its torque.
+def slowed_to_exert(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) -> Trajectory:
+    """Return a motion, slowed where the muscles could not exert its torque otherwise.
 
         τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
-    The factor s is the smallest of `SLOWER` for which the largest missing torque of the motion is
-    at most `NOTABLE` above that of a very slow motion. If a motion lacks torque at one instant
-    however slow it is, it is therefore not slowed because of a smaller lack at another instant. If
-    no factor suffices, s is the largest of `SLOWER`. If the muscle modules provide no tensions, s
-    is 1. An arm without isolated muscles may use all tensions up to T_limit. For an arm with
-    isolated muscles, the factors are those of `SLOWER_ISOLATED`, and the highest tension is that of
-    `PathLimits`, which keeps a reserve. `loss` is defined there, too.
+    At each instant, the factor s is the smallest of `SLOWER` for which the largest missing torque
+    is at most `NOTABLE` above that of a very slow motion anywhere on the way. If a motion lacks
+    torque at one instant however slow it is, it is therefore not slowed because of a smaller lack
+    at another instant. If no factor suffices, s is the largest of `SLOWER`. The factor changes
+    gradually along the way (`_eased`). If the muscle modules provide no tensions, the motion is not
+    slowed.
+
+    An arm without isolated muscles may use all tensions up to T_limit. An arm with isolated muscles
+    is slowed as much on the whole way. Its factors are those of `SLOWER_ISOLATED`, and the highest
+    tension is that of `PathLimits`, which keeps a reserve. `loss` is defined there, too.
 
     Args:
         robot: The robot; isolated muscles have no tension.
@@ -72,25 +81,66 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
     time, theta = trajectory.path
     is_still = (theta == theta[0]).all()
     if not robot.tension_source.is_known or is_still:
-        return 1.0
-    factors, used = (SLOWER, 1.0) if robot.used.all() else (SLOWER_ISOLATED, USED)
+        return trajectory
+    is_whole = bool(robot.used.all())
+    factors, used = (SLOWER, 1.0) if is_whole else (SLOWER_ISOLATED, USED)
     limits, bias, lag = PathLimits(robot, mae, used), robot.tension.bias, max(lag, LEAST_LAG)
     travelled = np.linalg.norm(np.diff(theta, axis=0), axis=1).cumsum()
     spacing = max(MOMENT_SPACING, travelled[-1] / MOST_EXERTIONS)
     marks = np.arange(0.0, travelled[-1], spacing)
-    moments = trajectory.sample(time[np.unique(np.searchsorted(travelled, marks)) + 1])
+    instants = time[np.unique(np.searchsorted(travelled, marks)) + 1]
+    moments = trajectory.sample(instants)
     jacobians = mae.muscle_jacobian(moments.theta, np.tile(bias, (len(moments.theta), 1)))
-    lacking = [  # the instants at which the muscles lack torque if the motion is not slowed
-        (jacobian, at)
-        for at, jacobian in zip(map(Setpoint._make, zip(*moments)), jacobians)
-        if limits.missing_in_motion(jacobian, at, lag, factors[0]) > NOTABLE
-    ]
-    very_slow = [limits.missing_in_motion(*moment, lag, np.inf) for moment in lacking]
-    legal = max(very_slow, default=0.0) + NOTABLE
-    number = 0
-    for moment in lacking:
-        while limits.missing_in_motion(*moment, lag, factors[number]) > legal:
-            number += 1
-            if number == len(factors) - 1:
-                return factors[number]
-    return factors[number]
+    every = [*zip(jacobians, map(Setpoint._make, zip(*moments)))]
+    lacking = {  # the instants at which the muscles lack torque if the motion is not slowed
+        n: moment
+        for n, moment in enumerate(every)
+        if limits.missing_in_motion(*moment, lag, factors[0]) > NOTABLE
+    }
+    if not lacking:
+        return trajectory
+    very_slow = [limits.missing_in_motion(*moment, lag, np.inf) for moment in lacking.values()]
+    legal = max(very_slow) + NOTABLE
+
+    def suffices(moment: tuple[Array, Setpoint], number: int) -> bool:
+        return limits.missing_in_motion(*moment, lag, factors[number]) <= legal
+
+    slower, number = np.ones(len(instants)), 0
+    for n, moment in lacking.items():
+        # Neighbouring instants need similar factors: search from the last one.
+        if suffices(moment, number):
+            while number > 0 and suffices(moment, number - 1):
+                number -= 1
+        else:
+            while number < len(factors) - 1 and not suffices(moment, number):
+                number += 1
+        slower[n] = factors[number]
+    if not is_whole:
+        slower[:] = slower.max()
+    if slower.max() == 1.0:
+        return trajectory
+    starts_moving = bool(trajectory.start.velocity.any())
+    return trajectory.eased(_eased(instants, slower, trajectory.duration, starts_moving))
+
+
+def _eased(instants: Array, slower: Array, duration: float, starts_moving: bool) -> Slowdown:
+    """Return a slowdown that changes gradually, and is at least as much as `slower`.
+
+    Args:
+        instants: Instants of the motion [s], (N,).
+        slower: Factors by which the motion has to be slowed at them, (N,).
+        duration: Duration of the motion [s].
+        starts_moving: Whether the arm moves at the beginning; the factor then begins at 1, because
+            the arm cannot change its velocity at once.
+    """
+    count = int(np.clip(duration / EASING_STEP, 1, MOST_MOMENTS))
+    time, reach = np.linspace(0.0, duration, count + 1), int(np.ceil(EASING / EASING_STEP))
+    # Between two instants, the larger of their factors applies.
+    after = np.searchsorted(instants, time)
+    factor = np.maximum(*(slower[np.clip(k, 0, len(slower) - 1)] for k in (after, after - 1)))
+    for summary in (np.max, np.mean):
+        padded = np.pad(factor, reach, mode='edge')
+        factor = summary(sliding_window_view(padded, 2 * reach + 1), axis=1)
+    if starts_moving:
+        factor = 1.0 + (factor - 1.0) * np.minimum(time / (2.0 * EASING), 1.0)
+    return Slowdown.by(time, factor)

@@ -11,18 +11,20 @@ The curve begins at the setpoint that the arm follows when the message arrives. 
 has passed are skipped. Joints that a message does not name keep the position of this setpoint. The
 arm holds the position of the last point. An empty message brings the arm to rest.
 
-A trajectory is slowed as a whole by a factor s: all times are multiplied by s, velocities divided
-by s and accelerations divided by s². If it starts at rest, its path stays the same.
+A trajectory is slowed in two ways. As a whole (`scaled`), all times are multiplied by a factor s,
+velocities divided by s and accelerations divided by s². If it starts at rest, its path stays the
+same. Where necessary (`eased`), the factor changes along the way, and the path always stays the
+same.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.report import distinct
@@ -65,6 +67,45 @@ class Setpoint(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Slowdown:
+    """Slows a trajectory by a factor that changes along the way.
+
+        dt/du = f(u),   u̇ = 1/f,   ü = −f'/f³
+
+    u is the time on the original trajectory, t that on the slowed one. The factor f is linear
+    between N instants.
+    """
+
+    original: Array  # u of the instants [s], (N,), increasing from 0
+    factor: Array  # f at the instants, (N,); positive
+    time: Array  # t at the instants [s], (N,)
+
+    @classmethod
+    def by(cls, original: Array, factor: Array) -> Slowdown:
+        """Return the slowdown by factors f (N,) at the instants u [s], (N,)."""
+        spans = 0.5 * (factor[1:] + factor[:-1]) * np.diff(original)
+        return cls(original, factor, np.append(0.0, np.cumsum(spans)))
+
+    def slowed(self, original: Array) -> Array:
+        """Return the times t [s] of instants u [s]."""
+        k, change = self._pieces(self.original, original)
+        after = original - self.original[k]
+        return self.time[k] + after * (self.factor[k] + 0.5 * change * after)
+
+    def at(self, time: Array) -> tuple[Array, Array, Array]:
+        """Return u [s], u̇ and ü [1/s] at times t [s]."""
+        k, change = self._pieces(self.time, time)
+        after, factor = time - self.time[k], self.factor[k]
+        now = np.sqrt(factor**2 + 2.0 * change * after)
+        return self.original[k] + 2.0 * after / (factor + now), 1.0 / now, -change / now**3
+
+    def _pieces(self, knots: Array, at: Array) -> tuple[Ints, Array]:
+        """Return the piece in which each instant is, and f' in it [1/s]."""
+        k = np.clip(np.searchsorted(knots, at, side='right') - 1, 0, len(knots) - 2)
+        return k, (np.diff(self.factor) / np.diff(self.original))[k]
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """A piecewise polynomial curve from `start` through points."""
 
@@ -73,7 +114,8 @@ class Trajectory:
     time: Array  # times of the knots [s], (K,); the first time is 0
     coefficients: Array  # coefficients of each piece, (K−1, 6, D)
     end: Array  # posture that is held after the last point [rad], (D,)
-    slowed: float = 1.0  # factor by which the trajectory was slowed
+    slowed: float = 1.0  # factor by which the slowed trajectory lasts longer
+    slowdown: Slowdown | None = None  # how it is slowed where necessary; None if it is not
 
     @classmethod
     def through(cls, start: Setpoint, points: TrajectoryPoints, passed: float = 0.0) -> Trajectory:
@@ -188,21 +230,31 @@ class Trajectory:
     def path(self) -> tuple[Array, Array]:
         """The curve at N instants, several in each piece: times [s], (N,), and θ [rad], (N, D)."""
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
-        inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
+        inner = (self.time[:-1, None] + np.diff(self.time)[:, None] * share).ravel()
+        time = np.append(inner, self.time[-1])
         theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)
         joints = len(self.end)
-        return np.append(inner, self.time[-1]), np.append(theta, self.end).reshape(-1, joints)
+        time = time if self.slowdown is None else self.slowdown.slowed(time)
+        return time, np.append(theta, self.end).reshape(-1, joints)
 
     @property
     def duration(self) -> float:
         """Duration of the trajectory [s]."""
-        return float(self.time[-1])
+        return float(self.time[-1] if self.slowdown is None else self.slowdown.time[-1])
 
     def sample(self, time: Array | float) -> Setpoint:
         """Return the setpoint at one time or at times (N,) [s].
 
         Before the start and after the end of the trajectory, the setpoint is at rest.
         """
+        if self.slowdown is not None:
+            original, rate, change = self.slowdown.at(np.clip(np.asarray(time), 0.0, self.duration))
+            at = replace(self, slowdown=None).sample(original)
+            rate, change = rate[..., None], change[..., None]
+            moving = ((np.asarray(time) >= 0.0) & (np.asarray(time) < self.duration))[..., None]
+            velocity = moving * at.velocity
+            acceleration = moving * at.acceleration * rate**2 + velocity * change
+            return Setpoint(at.theta, velocity * rate, acceleration)
         inner = np.clip(np.asarray(time), 0.0, self.time[-1])
         piece = np.clip(np.searchsorted(self.time, inner, side='right') - 1, 0, len(self.time) - 2)
         span = np.diff(self.time)[piece]
@@ -217,8 +269,18 @@ class Trajectory:
         return Setpoint(theta, moving * velocity * rate, moving * acceleration * rate**2)
 
     def scaled(self, slower: float) -> Trajectory:
-        """Return the trajectory slowed by the factor `slower`."""
+        """Return the trajectory slowed as a whole by the factor `slower`.
+
+        A trajectory that has been slowed where necessary can no longer be slowed as a whole.
+        """
+        assert self.slowdown is None
         return self._joined(self.start, self.points.later(slower), self.slowed * slower)
+
+    def eased(self, slowdown: Slowdown) -> Trajectory:
+        """Return the trajectory slowed where necessary, as `slowdown` states."""
+        assert self.slowdown is None
+        longer = float(slowdown.time[-1] / slowdown.original[-1])
+        return replace(self, slowdown=slowdown, slowed=self.slowed * longer)
 
 
 def _halt(start: Setpoint, robot: Robot) -> Array:

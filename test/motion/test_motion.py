@@ -28,8 +28,8 @@ from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.holdable_paths import NOTABLE, PathLimits
 from musculoskeletal_ae.motion.methods import StiffnessModel
-from musculoskeletal_ae.motion.slowness import SHARE, exertion_slowness, slowness
-from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.motion.slowness import SHARE, slowed_to_exert, slowness
+from musculoskeletal_ae.motion.trajectory import Setpoint, Slowdown, Trajectory
 from musculoskeletal_ae.motion.winches import Winches
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -413,7 +413,7 @@ def test_a_motion_that_lacks_torque_at_any_speed_is_slowed_only_as_far_as_that_h
     mae, lag, slowed = ExactMae(robot), 0.02, []
     limits = PathLimits(robot, mae, used=1.0)
 
-    def lack(motion, slower):
+    def lack(motion, slower=1.0):
         """Return the largest missing torque of a slowed motion [N·m]."""
         instants = map(Setpoint._make, zip(*motion.sample(np.linspace(0.0, motion.duration, 60))))
         return max(
@@ -427,9 +427,30 @@ def test_a_motion_that_lacks_torque_at_any_speed_is_slowed_only_as_far_as_that_h
         motion = Trajectory.to(Setpoint.resting(start), goal[None], 1.0)
         at_any_speed = lack(motion, np.inf)
         if at_any_speed > 1.0:
-            slowed.append(exertion_slowness(robot, mae, motion, lag))
-            assert lack(motion, slowed[-1]) < at_any_speed + 2.0 * NOTABLE
-    assert slowed and max(slowed) < 3.0
+            slowed.append(slowed_to_exert(robot, mae, motion, lag))
+            assert lack(slowed[-1]) < at_any_speed + 2.0 * NOTABLE
+    assert slowed and max(motion.slowed for motion in slowed) < 3.0
+
+
+def test_slowing_where_necessary_keeps_the_path_and_its_derivatives():
+    start = Setpoint(REST, np.array([0.4, -0.2]), np.zeros(2))
+    motion = Trajectory.to(start, OTHER, 1.0)
+    original = np.linspace(0.0, 1.0, 41)
+    slowdown = Slowdown.by(original, 1.0 + 0.5 * np.sin(np.pi * original) ** 2)
+    slow = motion.eased(slowdown)
+    assert slow.duration == pytest.approx(1.25, abs=0.01) == slow.slowed
+    time = np.linspace(0.01, slow.duration - 0.01, 300)
+    at, step = slow.sample(time), 1e-4
+    np.testing.assert_allclose(at.theta, motion.sample(slowdown.at(time)[0]).theta)
+    np.testing.assert_allclose(slowdown.slowed(slowdown.at(time)[0]), time)
+    late, early = slow.sample(time + step), slow.sample(time - step)
+    numeric = (late.theta - early.theta) / (2.0 * step)
+    np.testing.assert_allclose(at.velocity, numeric, atol=1e-3)
+    numeric = (late.velocity - early.velocity) / (2.0 * step)
+    assert np.median(np.abs(at.acceleration - numeric)) < 1e-3
+    np.testing.assert_allclose(slow.path[1], motion.path[1])
+    np.testing.assert_allclose(slow.sample(slow.path[0]).theta, motion.path[1], atol=1e-9)
+    np.testing.assert_allclose(slow.sample(0.0).velocity, start.velocity)
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():
