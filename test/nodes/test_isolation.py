@@ -8,8 +8,10 @@ import pytest
 from controlled_arm import ControlledArm
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.estimation.body_memory import FILE
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.signals.body_state import Anomaly
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
@@ -126,6 +128,21 @@ def test_a_restarted_estimator_remembers_isolated_muscles(graph, arm26, trained)
     graph.wait(lambda: has_network(restarted, 6), 'the next network')
     assert restarted.core.mae.isolated == restarted.core.body.isolated == (2,)
     assert bodies[-1].isolated == (2,)
+
+
+def test_an_isolation_that_could_not_be_saved_is_saved_once_that_is_possible(
+    graph, arm26, tmp_path
+):
+    state = tmp_path / 'state'
+    state.write_text('')  # a file where the directory should be
+    graph.host(HardwareEmulatorNode, robot='arm26')
+    name = arm26.muscles[1]
+    common = {'robot': 'arm26', 'state_directory': str(state)}
+    estimator = graph.host(EstimatorNode, isolate_muscles=[name], **common)
+    graph.wait(lambda: estimator.memory.problem, 'the failed attempt')
+    state.unlink()
+    graph.wait((state / FILE).exists, 'the next attempt')
+    assert name in (state / FILE).read_text()
 
 
 def test_the_estimator_isolates_no_muscle_because_a_network_lacks_it(graph, trained, tmp_path):
