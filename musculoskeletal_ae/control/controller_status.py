@@ -22,6 +22,7 @@ from musculoskeletal_ae.signals.heat import soon
 if TYPE_CHECKING:
     from musculoskeletal_ae.control.controller import Controller
 
+NOTABLY = 1.01  # state that a trajectory was slowed if it lasts longer by this factor
 #: below this share of the requested speed, state the duration of a slowed trajectory instead of its
 #: speed [%]
 LEAST_SHARE = 10.0
@@ -243,9 +244,9 @@ def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
 
 
 def slowed(follower: Follower) -> str:
-    """Return a text on how much the last trajectory was slowed; '' if it was not slowed."""
+    """Return a text on how much the last trajectory was slowed; '' if it was hardly slowed."""
     last = follower.progress.latest
-    if last is None or last.slowed == 1.0:
+    if last is None or last.slowed < NOTABLY:
         return ''
     share = 100.0 / last.slowed
     if share < LEAST_SHARE:

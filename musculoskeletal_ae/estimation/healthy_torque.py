@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures joint damping, and the external torque that is wrongly estimated without contact.
 
-    σ_j² ← σ_j² + (dt / t) (τ_j² − σ_j²)
-    d_j  = max(0, d_0,j − E[θ̇_j τ'_j] / (E[θ̇_j²] + SLOW²)),   τ'_j = τ_j + (d_0,j − d_j,used) θ̇_j
+    σ_j² ← σ_j² + (dt / t_j) (τ_j² − σ_j²)
+    d_j  = max(0, d_0,j − E[θ̇_j³ τ'_j] / (E[θ̇_j⁴] + SLOW⁴)),   τ'_j = τ_j + (d_0,j − d_j,used) θ̇_j
 
 τ_j is the estimated external torque of joint j of the healthy moving arm, and σ_j its root mean
 square. If the joint is damped more than the estimate assumed (d_j,used), τ_j opposes the velocity
-θ̇_j. d_j is the damping that explains this best, and d_0,j that of the robot description. The means
-E are formed like σ_j². t is the time of motion so far, limited to MEMORY.
+θ̇_j. d_j is the damping that explains this best, and d_0,j that of the robot description. The weight
+θ̇_j² makes d_j right for fast motion: d_j also stands for friction that does not grow with the
+velocity. The means E are formed like σ_j². t_j is the time of motion in which τ_j was known, and at
+most MEMORY.
 
 `estimation/contact.py` divides the external torque by σ to decide whether there is contact. The
 damping becomes part of the network's `elasticity`, so that contact detection and motion plans
@@ -28,29 +30,34 @@ MOVING = 0.05  # measure only while the norm of the joint velocities exceeds thi
 #: clip external torques to this multiple of σ before they enter the average, because larger ones
 #: indicate contact
 OUTLIER = 5.0
+#: do not measure the damping of a joint while its external torque exceeds this multiple of σ: a
+#: hand may push the joint, and a push along or against its motion would look like damping
+PUSHED = 2.5
 #: keep the damping of the description until the joint has moved faster than about this [rad/s]
-SLOW = 0.02
+SLOW = 0.1
+#: average an adopted damping as if it had been measured at about this velocity [rad/s]
+USUAL = 0.3
 LEAST_SPREAD = 1e-3  # store at least this σ in the network [N·m], because torques are divided by it
 
 
 class HealthyTorque:
     """Measures the damping of the joints, and the external torque σ that remains unexplained.
 
-    The average covers the last minutes of motion, even if the network changed meanwhile.
+    The averages cover the last minutes of motion, even if the network changed meanwhile. Nothing is
+    measured until a network knows the friction of the tendons, which would count as damping.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._stated = robot.kinematics.elasticity
-        nothing = np.zeros(robot.joint_count)
-        #: means of τ², θ̇² and θ̇ τ', each (D,)
-        self._means = np.array([nothing, nothing, nothing])
-        self._time = 0.0
+        self._means = np.zeros((3, robot.joint_count))  # means of τ², θ̇⁴ and θ̇³ τ'
+        self._time = np.zeros(robot.joint_count)  # t_j [s]
+        self._is_measuring = False
 
     @property
     def damping(self) -> Array:
         """Damping of each joint [N·m·s/rad], (D,)."""
-        _, square, product = self._means
-        damping: Array = np.maximum(self._stated.damping - product / (square + SLOW**2), 0.0)
+        _, fourth, product = self._means
+        damping: Array = np.maximum(self._stated.damping - product / (fourth + SLOW**4), 0.0)
         return damping
 
     def put_into(self, mae: Mae) -> Mae:
@@ -58,21 +65,35 @@ class HealthyTorque:
 
         A network that contains no σ is returned unchanged. Before the first measurement, the values
         of the network are adopted instead, and later measurements are averaged with them. Damping
-        needs as much motion as the detection of contact (`TouchStatistics.calibrated`).
+        needs as much motion as the detection of contact (`TouchStatistics.calibrated`). Until a
+        joint has moved so much away from its stops, it keeps its damping, and its σ is at least
+        those of the other joints.
         """
-        if (known := mae.touch) is None:
+        known = mae.touch
+        self._is_measuring = known is not None
+        if known is None:
             return mae
         springs = mae.elasticity or self._stated
-        if self._time == 0.0:
-            square = np.full_like(known.spread, SLOW**2)
-            product = -2.0 * square * (springs.damping - self._stated.damping)
-            self._means, self._time = np.array([known.spread**2, square, product]), known.time
+        if not self._time.any():
+            if known.time == 0.0:
+                return mae
+            fourth = np.full_like(known.spread, USUAL**4)
+            product = (fourth + SLOW**4) * (self._stated.damping - springs.damping)
+            self._means = np.array([known.spread**2, fourth, product])
+            self._time = np.full_like(known.spread, known.time)
             return mae
         spread = np.maximum(np.sqrt(self._means[0]), LEAST_SPREAD)
-        touch = replace(known, spread=spread, time=self._time)
+        touch = replace(known, spread=spread, time=float(self._time.max()))
         if not touch.calibrated:
             return replace(mae, touch=touch)
-        return replace(mae, touch=touch, elasticity=replace(springs, damping=self.damping))
+        enough = self._time >= LEAST_MOTION
+        spread = np.where(enough, spread, np.maximum(spread, spread[enough].max()))
+        damping = np.where(enough, self.damping, springs.damping)
+        return replace(
+            mae,
+            touch=replace(touch, spread=spread),
+            elasticity=replace(springs, damping=damping),
+        )
 
     def step(self, torque: Array, velocity: Array, damping: Array, dt: float) -> None:
         """Update damping and residual torque with a message of the healthy arm, if the arm moves.
@@ -83,15 +104,16 @@ class HealthyTorque:
             damping: Damping of the joints that this estimate assumed [N·m·s/rad], (D,).
             dt: Time since the previous message [s].
         """
-        if np.linalg.norm(velocity) < MOVING:
+        if not self._is_measuring or np.linalg.norm(velocity) < MOVING:
             return
-        clipped = torque
-        if self._time > LEAST_MOTION:
-            bound = OUTLIER * np.sqrt(self._means[0])
-            clipped = np.clip(torque, -bound, bound)
-        opposed = velocity * (clipped + (self._stated.damping - damping) * velocity)
-        self._time = min(self._time + dt, MEMORY)
-        # A torque of exactly 0 means that the joint is at its stop, where τ_ext is unknown; keep
+        spread = np.where(self._time > LEAST_MOTION, np.sqrt(self._means[0]), np.inf)
+        square = np.minimum(torque**2, (OUTLIER * spread) ** 2)
+        opposed = velocity**3 * (torque + (self._stated.damping - damping) * velocity)
+        # A torque of exactly 0 means that the joint is near a stop, where τ_ext is unknown; keep
         # its σ and its damping.
-        change = np.array([clipped**2, velocity**2, opposed]) - self._means
-        self._means = self._means + dt / self._time * np.where(torque == 0.0, 0.0, change)
+        measured = torque != 0.0
+        self._time = np.minimum(self._time + dt * measured, MEMORY)
+        share = measured * dt / np.maximum(self._time, dt)
+        of_damping = share * (np.abs(torque) <= PUSHED * spread)
+        change = np.array([square, velocity**4, opposed]) - self._means
+        self._means = self._means + np.array([share, of_damping, of_damping]) * change

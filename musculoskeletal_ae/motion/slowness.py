@@ -30,12 +30,16 @@ SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: assume at least this lag λ in plans [s], because λ is measured only after the motion has begun
 LEAST_LAG = 0.02
 MOMENT_SPACING = 0.06  # compute tensions at instants that are at least this motion apart [rad]
-#: compute tensions at no more instants than this; 500 instants take about 30 ms
+#: compute tensions at no more instants than this; 500 instants take 30 to 250 ms, depending on at
+#: how many of them the muscles lack torque
 MOST_EXERTIONS = 500
 #: begin to slow a motion this long before the muscles would lack torque, and end this long
 #: afterwards [s]; a sudden change would itself cost torque
 EASING = 0.07
 EASING_STEP = 0.01  # state the factor at instants that are this far apart [s]
+#: increase the factor by at most this per second at the beginning of a motion that starts from
+#: another one; a moving arm cannot slow down at once
+BRAKING = 2.0
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
@@ -61,8 +65,8 @@ def slowed_to_exert(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) 
         τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
-    At each instant, the factor s is the smallest of `SLOWER` for which the largest missing torque
-    is at most `NOTABLE` above that of a very slow motion anywhere on the way. If a motion lacks
+    At each instant, the factor s is the smallest of `SLOWER` with which the muscles lack at most
+    `NOTABLE` more torque than a very slow motion lacks at its worst instant. If a motion lacks
     torque at one instant however slow it is, it is therefore not slowed because of a smaller lack
     at another instant. If no factor suffices, s is the largest of `SLOWER`. The factor changes
     gradually along the way (`_eased`). If the muscle modules provide no tensions, the motion is not
@@ -124,23 +128,29 @@ def slowed_to_exert(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) 
 
 
 def _eased(instants: Array, slower: Array, duration: float, starts_moving: bool) -> Slowdown:
-    """Return a slowdown that changes gradually, and is at least as much as `slower`.
+    """Return a slowdown that changes gradually, and is nowhere less than `slower`.
+
+    Only if the arm moves at the beginning, the slowdown is less there: it begins with a factor of 1
+    and grows by BRAKING, because the arm cannot change its velocity at once.
 
     Args:
         instants: Instants of the motion [s], (N,).
         slower: Factors by which the motion has to be slowed at them, (N,).
         duration: Duration of the motion [s].
-        starts_moving: Whether the arm moves at the beginning; the factor then begins at 1, because
-            the arm cannot change its velocity at once.
+        starts_moving: Whether the arm moves at the beginning.
     """
     count = int(np.clip(duration / EASING_STEP, 1, MOST_MOMENTS))
-    time, reach = np.linspace(0.0, duration, count + 1), int(np.ceil(EASING / EASING_STEP))
+    time = np.linspace(0.0, duration, count + 1)
     # Between two instants, the larger of their factors applies.
     after = np.searchsorted(instants, time)
     factor = np.maximum(*(slower[np.clip(k, 0, len(slower) - 1)] for k in (after, after - 1)))
+    reached = np.searchsorted(time, instants)
+    for k in (reached, np.maximum(reached - 1, 0)):
+        np.maximum.at(factor, k, slower)
+    reach = max(1, round(EASING / time[1]))
     for summary in (np.max, np.mean):
         padded = np.pad(factor, reach, mode='edge')
         factor = summary(sliding_window_view(padded, 2 * reach + 1), axis=1)
     if starts_moving:
-        factor = 1.0 + (factor - 1.0) * np.minimum(time / (2.0 * EASING), 1.0)
+        factor = np.minimum(factor, 1.0 + BRAKING * time)
     return Slowdown.by(time, factor)

@@ -175,6 +175,9 @@ class Robot:
         own, stated = elasticity, self.description.joint_elasticity
         if own is None:
             own = stated
+        elif own.damping.any() and not (own.stiffness.any() or own.preload.any()):
+            # Only the damping was measured. The user may have stated springs since then.
+            own = replace(stated, damping=own.damping)
         elif stated.tendons and not own.tendons:
             # Passive tendons are not learned, so a network does not contain them.
             own = replace(own, tendons=stated.tendons)

@@ -12,6 +12,7 @@ from musculoskeletal_ae.estimation.contact import CONTACT, ContactEstimator
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
@@ -180,22 +181,67 @@ def test_healthy_torque_is_measured_in_motion_and_a_touch_hardly_counts(mae):
     assert (core.put_into(unknown).touch.spread < 1.5 * healthy.spread).all()
 
 
-def test_damping_is_measured_and_kept_in_the_network(robot, mae):
-    true, rng, used = np.array([0.9, 0.3]), np.random.default_rng(0), np.zeros(2)
-    core = HealthyTorque(robot)
-    for _ in range(round(200.0 / DT)):
+def unmeasured(mae):
+    return replace(mae, touch=TouchStatistics(np.zeros(6), np.ones(2), 0.0))
+
+
+def swing(core, mae, seconds, true=(0.9, 0.3), push=0.0, is_free=True):
+    """Move joints with this damping; the network is updated every 10 s."""
+    true, rng, used = np.array(true), np.random.default_rng(0), np.zeros(2)
+    for n in range(round(seconds / DT)):
+        if n % 1000 == 0 and (damped := core.put_into(mae)).elasticity is not None:
+            used = damped.elasticity.damping
         velocity = rng.normal(0.0, 0.2, 2)
-        core.step(rng.normal(0.0, 0.1, 2) - (true - used) * velocity, velocity, used, DT)
-        used = core.damping
-    damped = core.put_into(replace(mae, touch=TouchStatistics(np.zeros(6), np.ones(2), 0.0)))
-    np.testing.assert_allclose(damped.elasticity.damping, true, atol=0.05)
-    np.testing.assert_allclose(damped.touch.spread, 0.1, rtol=0.1)
+        torque = rng.normal(0.0, 0.1, 2) - (true - used) * velocity + push * np.sign(velocity)
+        core.step(torque * is_free, velocity, used, DT)
+    return core.put_into(mae)
+
+
+def test_damping_is_measured_and_kept_in_the_network(robot, mae):
+    core = HealthyTorque(robot)
+    damped = swing(core, unmeasured(mae), 240.0)
+    np.testing.assert_allclose(damped.elasticity.damping, (0.9, 0.3), atol=0.05)
+    assert (damped.touch.spread < 0.15).all()
     contact = ContactEstimator(robot)
     contact.use(damped)
     np.testing.assert_array_equal(contact.damping, damped.elasticity.damping)
-    later = HealthyTorque(robot)  # such as after a restart
-    later.put_into(damped)
-    np.testing.assert_allclose(later.damping, core.damping)
+
+
+def test_damping_lasts_over_a_restart_and_a_push_hardly_changes_it(robot, mae):
+    damped = swing(HealthyTorque(robot), unmeasured(mae), 240.0)
+    restarted = HealthyTorque(robot)
+    restarted.put_into(damped)
+    after = swing(restarted, unmeasured(mae), 1.0)
+    np.testing.assert_allclose(after.elasticity.damping, (0.9, 0.3), atol=0.1)
+    for push in (4.0, -4.0):
+        after = swing(restarted, unmeasured(mae), 10.0, push=push)
+        np.testing.assert_allclose(after.elasticity.damping, (0.9, 0.3), atol=0.1)
+
+
+def test_a_joint_at_its_stop_takes_the_residual_torque_of_the_others(robot, mae):
+    core = HealthyTorque(robot)
+    core.put_into(unmeasured(mae))
+    at_stop = swing(core, unmeasured(mae), LEAST_MOTION + 2.0, is_free=np.array([True, False]))
+    assert at_stop.touch.calibrated
+    assert at_stop.touch.spread[1] == at_stop.touch.spread[0]
+    np.testing.assert_array_equal(at_stop.elasticity.damping[1], 0.0)
+
+
+def test_nothing_is_measured_until_the_friction_of_the_tendons_is_known(robot, mae):
+    core = HealthyTorque(robot)
+    swing(core, replace(mae, touch=None), 100.0, true=(5.0, 5.0))
+    damped = swing(core, unmeasured(mae), 100.0)
+    np.testing.assert_allclose(damped.elasticity.damping, (0.9, 0.3), atol=0.05)
+
+
+def test_springs_that_are_stated_later_add_to_a_measured_damping(robot, mae):
+    damped = swing(HealthyTorque(robot), unmeasured(mae), 100.0)
+    stiffness = np.diag([0.0, 4.0])
+    stated = JointElasticity(stiffness, np.array([0.0, -1.2]), np.zeros(2))
+    sprung = Robot(replace(robot.description, joint_elasticity=stated))
+    used = sprung.with_elasticity(damped.elasticity).kinematics.elasticity
+    np.testing.assert_array_equal(used.stiffness, stiffness)
+    np.testing.assert_array_equal(used.damping, damped.elasticity.damping)
 
 
 def test_a_network_is_used_with_the_residual_torque_measured_so_far(robot, mae):

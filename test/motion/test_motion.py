@@ -28,7 +28,7 @@ from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.holdable_paths import NOTABLE, PathLimits
 from musculoskeletal_ae.motion.methods import StiffnessModel
-from musculoskeletal_ae.motion.slowness import SHARE, slowed_to_exert, slowness
+from musculoskeletal_ae.motion.slowness import BRAKING, SHARE, _eased, slowed_to_exert, slowness
 from musculoskeletal_ae.motion.trajectory import Setpoint, Slowdown, Trajectory
 from musculoskeletal_ae.motion.winches import Winches
 from musculoskeletal_ae.robot.robot import Robot
@@ -451,6 +451,17 @@ def test_slowing_where_necessary_keeps_the_path_and_its_derivatives():
     np.testing.assert_allclose(slow.path[1], motion.path[1])
     np.testing.assert_allclose(slow.sample(slow.path[0]).theta, motion.path[1], atol=1e-9)
     np.testing.assert_allclose(slow.sample(0.0).velocity, start.velocity)
+
+
+@pytest.mark.parametrize('duration', [0.08, 1.0, 1000.0])
+def test_slowing_is_nowhere_less_than_necessary(duration):
+    rng = np.random.default_rng(0)
+    instants = np.sort(rng.uniform(0.0, min(duration, 1.0), 17))
+    slower = rng.choice([1.0, 1.1, 4.6], 17)
+    slowdown = _eased(instants, slower, duration, starts_moving=False)
+    assert (np.interp(instants, slowdown.original, slowdown.factor) > slower - 1e-9).all()
+    braked = _eased(instants, slower, duration, starts_moving=True)
+    assert (braked.factor <= 1.0 + BRAKING * braked.original).all()
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():

@@ -171,7 +171,7 @@ class CheckpointValidator:
     def is_in_use(self, mae: Mae) -> bool:
         """Return whether a network is the one in use, which needs no further decision.
 
-        Isolated muscles, detector and residual torque do not distinguish networks.
+        Isolated muscles, detector, damping and residual torque do not distinguish networks.
         """
         in_use = self.mae
         return (
