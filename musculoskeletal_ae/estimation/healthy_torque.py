@@ -30,9 +30,10 @@ MOVING = 0.05  # measure only while the norm of the joint velocities exceeds thi
 #: clip external torques to this multiple of σ before they enter the average, because larger ones
 #: indicate contact
 OUTLIER = 5.0
-#: do not measure the damping of a joint while its external torque exceeds this multiple of σ: a
-#: hand may push the joint, and a push along or against its motion would look like damping
-PUSHED = 2.5
+#: clip external torques to this multiple of σ before they change the damping, and leave out those
+#: beyond OUTLIER: a push along or against the motion of a joint looks like damping. While the
+#: damping is wrong, clipped torques still change it in the right direction.
+PUSHED = 1.5
 #: keep the damping of the description until the joint has moved faster than about this [rad/s]
 SLOW = 0.1
 #: average an adopted damping as if it had been measured at about this velocity [rad/s]
@@ -108,12 +109,13 @@ class HealthyTorque:
             return
         spread = np.where(self._time > LEAST_MOTION, np.sqrt(self._means[0]), np.inf)
         square = np.minimum(torque**2, (OUTLIER * spread) ** 2)
-        opposed = velocity**3 * (torque + (self._stated.damping - damping) * velocity)
+        clipped = np.clip(torque, -PUSHED * spread, PUSHED * spread)
+        opposed = velocity**3 * (clipped + (self._stated.damping - damping) * velocity)
         # A torque of exactly 0 means that the joint is near a stop, where τ_ext is unknown; keep
         # its σ and its damping.
         measured = torque != 0.0
         self._time = np.minimum(self._time + dt * measured, MEMORY)
         share = measured * dt / np.maximum(self._time, dt)
-        of_damping = share * (np.abs(torque) <= PUSHED * spread)
+        of_damping = share * (np.abs(torque) <= OUTLIER * spread)
         change = np.array([square, velocity**4, opposed]) - self._means
         self._means = self._means + np.array([share, of_damping, of_damping]) * change

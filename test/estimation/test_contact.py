@@ -207,6 +207,13 @@ def test_damping_is_measured_and_kept_in_the_network(robot, mae):
     np.testing.assert_array_equal(contact.damping, damped.elasticity.damping)
 
 
+def test_damping_is_found_even_if_it_exceeds_the_noise_by_far(robot, mae):
+    core = HealthyTorque(robot)
+    swing(core, unmeasured(mae), 100.0, true=(0.0, 0.0))
+    damped = swing(core, unmeasured(mae), 600.0, true=(1.5, 1.0))
+    np.testing.assert_allclose(damped.elasticity.damping, (1.5, 1.0), atol=0.2)
+
+
 def test_damping_lasts_over_a_restart_and_a_push_hardly_changes_it(robot, mae):
     damped = swing(HealthyTorque(robot), unmeasured(mae), 240.0)
     restarted = HealthyTorque(robot)
