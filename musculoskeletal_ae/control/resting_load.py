@@ -107,7 +107,7 @@ class RestingLoad:
     def _compare(self, theta: Array, pull: Array, dt: float, spread: Array) -> None:
         self._rested += dt
         torque = self._contact.step(theta, pull, dt).torque
-        self._is_free &= torque != 0.0  # 0: near a stop, the torque is unknown
+        self._is_free &= torque != 0.0  # a torque of 0 is that of a joint near a stop
         self._torque = self._torque + dt / (dt + AVERAGING) * (torque - self._torque)
         if self._reference is None:
             if self._rested > REFERENCE:

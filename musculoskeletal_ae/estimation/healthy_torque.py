@@ -54,13 +54,6 @@ class HealthyTorque:
         self._time = np.zeros(robot.joint_count)  # t_j [s]
         self._is_measuring = False
 
-    @property
-    def damping(self) -> Array:
-        """Damping of each joint [N·m·s/rad], (D,)."""
-        _, fourth, product = self._means
-        damping: Array = np.maximum(self._stated.damping - product / (fourth + SLOW**4), 0.0)
-        return damping
-
     def put_into(self, mae: Mae) -> Mae:
         """Put the measured damping and residual torque σ into a copy of a network; return the copy.
 
@@ -89,7 +82,9 @@ class HealthyTorque:
             return replace(mae, touch=touch)
         enough = self._time >= LEAST_MOTION
         spread = np.where(enough, spread, np.maximum(spread, spread[enough].max()))
-        damping = np.where(enough, self.damping, springs.damping)
+        _, fourth, product = self._means
+        measured = np.maximum(self._stated.damping - product / (fourth + SLOW**4), 0.0)
+        damping = np.where(enough, measured, springs.damping)
         return replace(
             mae,
             touch=replace(touch, spread=spread),
@@ -97,7 +92,9 @@ class HealthyTorque:
         )
 
     def step(self, torque: Array, velocity: Array, damping: Array, dt: float) -> None:
-        """Update damping and residual torque with a message of the healthy arm, if the arm moves.
+        """Update damping and residual torque with the estimate from one message, if the arm moves.
+
+        The arm has to be healthy.
 
         Args:
             torque: Estimated external torques at the joints [N·m], (D,).

@@ -7,9 +7,9 @@
 
 The learner does not judge its networks. It saves a candidate when the estimator has accepted it. If
 the estimator rejects the newest one, the learner returns to the network that the estimator uses.
-The estimator adds damping and residual torque to a network that it accepts; the learner saves them
-and copies them into the next candidate. Without an estimator nobody rejects a network, and each one
-is saved at once.
+The estimator adds what it has measured to a network that it accepts: the damping of the joints and
+their residual torque. The learner saves both, and copies them into the next candidate. Without an
+estimator nobody rejects a network, and each one is saved at once.
 
 A network is saved before it is published. A failed save is retried, and does not prevent the
 publication. At most one update a second begins (`scheduler`), so candidates are no more frequent.

@@ -30,8 +30,8 @@ SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: assume at least this lag λ in plans [s], because λ is measured only after the motion has begun
 LEAST_LAG = 0.02
 MOMENT_SPACING = 0.06  # compute tensions at instants that are at least this motion apart [rad]
-#: compute tensions at no more instants than this; 500 instants take 30 to 250 ms, depending on at
-#: how many of them the muscles lack torque
+#: compute tensions at no more instants than this; 500 instants take about 30 ms, and longer if the
+#: muscles lack torque at many of them
 MOST_EXERTIONS = 500
 #: begin to slow a motion this long before the muscles would lack torque, and end this long
 #: afterwards [s]; a sudden change would itself cost torque

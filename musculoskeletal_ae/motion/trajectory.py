@@ -93,7 +93,7 @@ class Slowdown:
         return self.time[k] + after * (self.factor[k] + 0.5 * change * after)
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
-        """Return u [s], u̇ and ü [1/s] at times t [s]."""
+        """Return the time u [s] on the original trajectory, u̇ and ü [1/s], at times t [s]."""
         k, change = self._pieces(self.time, time)
         after, factor = time - self.time[k], self.factor[k]
         now = np.sqrt(factor**2 + 2.0 * change * after)
@@ -102,7 +102,8 @@ class Slowdown:
     def _pieces(self, knots: Array, at: Array) -> tuple[Ints, Array]:
         """Return the piece in which each instant is, and f' in it [1/s]."""
         k = np.clip(np.searchsorted(knots, at, side='right') - 1, 0, len(knots) - 2)
-        return k, (np.diff(self.factor) / np.diff(self.original))[k]
+        factor, original = self.factor, self.original
+        return k, (factor[k + 1] - factor[k]) / (original[k + 1] - original[k])
 
 
 @dataclass(frozen=True)
@@ -247,26 +248,31 @@ class Trajectory:
 
         Before the start and after the end of the trajectory, the setpoint is at rest.
         """
-        if self.slowdown is not None:
-            original, rate, change = self.slowdown.at(np.clip(np.asarray(time), 0.0, self.duration))
-            at = replace(self, slowdown=None).sample(original)
+        time = np.asarray(time)
+        within = np.clip(time, 0.0, self.duration)
+        if self.slowdown is None:
+            theta, velocity, acceleration = self._original(within)
+        else:
+            original, rate, change = self.slowdown.at(within)
+            theta, velocity, acceleration = self._original(original)
             rate, change = rate[..., None], change[..., None]
-            moving = ((np.asarray(time) >= 0.0) & (np.asarray(time) < self.duration))[..., None]
-            velocity = moving * at.velocity
-            acceleration = moving * at.acceleration * rate**2 + velocity * change
-            return Setpoint(at.theta, velocity * rate, acceleration)
-        inner = np.clip(np.asarray(time), 0.0, self.time[-1])
-        piece = np.clip(np.searchsorted(self.time, inner, side='right') - 1, 0, len(self.time) - 2)
+            acceleration = acceleration * rate**2 + velocity * change
+            velocity = velocity * rate
+        moving = ((time >= 0.0) & (time < self.duration))[..., None]
+        return Setpoint(theta, moving * velocity, moving * acceleration)
+
+    def _original(self, time: Array) -> Setpoint:
+        """Return the setpoint of the curve before `eased`, at times from 0 to its end [s]."""
+        piece = np.clip(np.searchsorted(self.time, time, side='right') - 1, 0, len(self.time) - 2)
         span = np.diff(self.time)[piece]
-        tau = ((inner - self.time[piece]) / span)[..., None]
+        tau = ((time - self.time[piece]) / span)[..., None]
         c, k = np.moveaxis(self.coefficients[piece], -2, 0), np.arange(6.0)
         powers = tau**k  # (..., 6)
         theta = np.einsum('k...d,...k->...d', c, powers)
         velocity = np.einsum('k...d,...k->...d', c[1:], k[1:] * powers[..., :-1])
         acceleration = np.einsum('k...d,...k->...d', c[2:], k[2:] * k[1:-1] * powers[..., :-2])
         rate = (1.0 / span)[..., None]
-        moving = ((np.asarray(time) >= 0.0) & (np.asarray(time) < self.duration))[..., None]
-        return Setpoint(theta, moving * velocity * rate, moving * acceleration * rate**2)
+        return Setpoint(theta, velocity * rate, acceleration * rate**2)
 
     def scaled(self, slower: float) -> Trajectory:
         """Return the trajectory slowed as a whole by the factor `slower`.

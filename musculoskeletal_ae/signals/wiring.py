@@ -244,7 +244,7 @@ def judge(
     while True:
         exchanged = (cycle, *single_faults(cycle, columns, signs=False))
         cost, better = min((misfit(each, columns), each) for each in exchanged)
-        if not cost < least:  # also true if a reading is missing
+        if not cost < least:  # also if the cost is NaN, because a reading is missing
             break
         cycle, least = better, cost
     if gain(cycle) > 0.0:

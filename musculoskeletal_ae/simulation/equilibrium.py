@@ -46,8 +46,9 @@ from musculoskeletal_ae.simulation.load import LoadTree, hold
 PAID_OUT = np.inf
 #: represent a position-controlled module by this K_stiff [N/m]; 400 N move such a module by 1 mm
 RIGID = 4e5
-#: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers of the description [N·s/rad]. Motions
-#: then take as long as on the emulated arm; values from 8 to 20 do equally well.
+#: The viscous resistance B of a joint is this times Σ_i |∂l_i/∂θ| [N·s/rad], plus the damping that
+#: the robot description states. Motions then take as long as on the emulated arm; values from 8 to
+#: 20 do equally well.
 VISCOSITY = 12.0
 #: average |∂l_i/∂θ| over this many random postures to get the viscous resistance B
 JACOBIAN_POSTURES = 100

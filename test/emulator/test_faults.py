@@ -80,7 +80,7 @@ def test_a_drift_goes_on_when_another_fault_is_added(robot):
         faults.pass_time(1.0)
     np.testing.assert_allclose(faults.apply(readings).muscles.length, 0.02)
     faults.set([])
-    faults.set([drift])  # a drift that begins again starts from 0
+    faults.set([drift])  # the drift was removed, so it starts from 0 again
     np.testing.assert_allclose(faults.apply(readings).muscles.length, 0.0)
 
 

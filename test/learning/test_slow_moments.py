@@ -43,7 +43,7 @@ def test_moments_do_not_extend_over_a_gap():
 
 
 def test_readings_before_a_gap_are_not_averaged_with_those_after_it():
-    for before in range(301, 312):  # a moment has 11 readings
+    for before in range(301, 312):  # 11 consecutive counts, because an average is over 11 readings
         time = np.concatenate([0.01 * np.arange(before), 5.0 + 0.01 * np.arange(300)])
         theta = np.where(time < 4.0, time, time - 1.0)  # slower in the gap than elsewhere
         values = np.array([sample.theta[0] for sample in samples(time, theta)])
