@@ -458,8 +458,7 @@ class Estimator:
             elapsed = max(sample.time - before.time, 0.0)
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
         self.joint_stream.pass_time(min(elapsed, LONGEST_STEP))
-        temperature = np.where(self.body.used, sample.temperature, np.nan)
-        self.health.heat.step(sample.motor_tension, temperature, elapsed)
+        self.health.follow(sample, sent_apart)
         if self.mae is None:
             return None
         self.stepped_at = now

@@ -134,6 +134,14 @@ class Detector:
             now: Time of the message on a steady clock [s].
         """
 
+    def follow(self, sample: MuscleSample, elapsed: float) -> None:
+        """Follow the sample of an accepted message, also without a network.
+
+        Args:
+            sample: The checked readings, with filtered temperatures.
+            elapsed: Time between the sending of the previous message and of this one [s].
+        """
+
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which the network has made an estimate; return a finding or None."""
 

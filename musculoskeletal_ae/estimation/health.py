@@ -22,8 +22,8 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class HealthMonitor:
@@ -33,7 +33,7 @@ class HealthMonitor:
         residual: The detector that compares the network's residual with its healthy spread; it also
             names the most suspect muscle.
         joint_sensors: The detector that decides which joint sensors are trusted.
-        heat: Thermal models of the muscle modules, which the caller updates.
+        heat: Thermal models of the muscle modules.
     """
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:
@@ -45,7 +45,8 @@ class HealthMonitor:
         """
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot)
-        self.heat = Heat(robot)
+        drift = ThermalDrift(robot)
+        self.heat = drift.heat
         self.joint_sensors = JointSensorTrust(robot)
         self._exchange = ExchangeCheck(robot)
         #: if several report a finding for the same message, only that of the first one counts
@@ -55,7 +56,7 @@ class HealthMonitor:
             LengthDisagreement(robot),
             FrozenSensor(robot),
             SaturatedSensor(robot),
-            ThermalDrift(robot, self.heat),
+            drift,
             MissingValues(robot),
             self._exchange,
             self.joint_sensors,
@@ -89,6 +90,11 @@ class HealthMonitor:
         """
         findings = [detector.read(readings, usable, now) for detector in self._detectors]
         return next(filter(None, findings), None)
+
+    def follow(self, sample: MuscleSample, elapsed: float) -> None:
+        """Let all detectors follow an accepted sample, as `Detector.follow` describes."""
+        for detector in self._detectors:
+            detector.follow(sample, elapsed)
 
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which there is an estimate; return the first finding or None.

@@ -217,17 +217,19 @@ def read_muscle_states(
     if not source.is_known:
         readings.tension = np.nan
     is_legal = np.isfinite(values)
+    if not is_legal.all():  # as in each message that lacks an optional row
+        may_be_nan = [
+            [quantity.presence is not Presence.REQUIRED]
+            if quantity is not MuscleReadings.tension
+            else [not source.is_known]
+            for quantity in QUANTITIES
+        ]
+        is_legal |= np.isnan(values) & may_be_nan
     if len(isolated) == 0 and is_legal.all():
         return readings
     is_isolated = np.isin(np.arange(robot.muscle_count), isolated)
     values[~(np.abs(values) < MOST_ISOLATED) & is_isolated] = np.nan
-    may_be_nan = [
-        [quantity.presence is not Presence.REQUIRED]
-        if quantity is not MuscleReadings.tension
-        else [not source.is_known]
-        for quantity in QUANTITIES
-    ]
-    is_legal |= is_isolated | (np.isnan(values) & may_be_nan)
+    is_legal |= is_isolated
     if not is_legal.all():
         quantity, muscle = first(~is_legal)
         stated = f'{quantity.name} of {robot.muscles[muscle]} is {quantity.of(readings)[muscle]}'

@@ -79,23 +79,24 @@ def test_an_optional_quantity_is_one_entry_of_the_table(monkeypatch, isolated):
         stream.take(message(resting()[:2]), 0.3)
 
 
-@pytest.mark.parametrize(
-    ('states', 'reason'),
-    [
-        (resting()[:2], 'wrong length'),
-        (resting(length=(1, np.nan)), 'not finite'),
-        (resting(tension=(1, 2.0 * ROBOT.tension.max[1])), 'tension beyond the maximum'),
-        (resting(temperature=(0, 500.0)), 'impossible temperature'),
-        (
-            resting(length=(0, 1.01 * longest_lengths(ROBOT)[0]), tension=(0, 100.0)),
-            'length beyond what the joints allow',
-        ),
-    ],
-)
-def test_what_no_sound_sensor_reads_is_rejected_with_the_reason(states, reason):
-    with pytest.raises(RejectionError) as rejection:
-        MuscleStream(ROBOT).take(message(states), 0.0)
-    assert rejection.value.reason == reason
+@pytest.mark.parametrize('quantity', QUANTITIES, ids=lambda quantity: quantity.name)
+def test_what_no_sound_sensor_reads_is_rejected_with_the_reason(quantity):
+    lowest, highest = (np.broadcast_to(bound, M)[0] for bound in quantity.possible(ROBOT))
+    beyond = highest + 0.01 * (highest - lowest)
+    sound = reading(resting(tension=(0, 100.0)))
+    reasons = {beyond: quantity.reason, np.inf: 'not finite'}
+    if quantity.presence is Presence.REQUIRED:
+        reasons[np.nan] = 'not finite'
+    for value, reason in reasons.items():
+        values = quantity.of(sound).copy()
+        values[0] = value
+        with pytest.raises(RejectionError) as rejection:
+            MuscleStream(ROBOT).take(message(sound.replace(**{quantity.name: values}).rows), 0.0)
+        assert rejection.value.reason == reason
+    if quantity.presence is not Presence.REQUIRED:
+        unknown = sound.replace(**{quantity.name: np.full(M, np.nan)})
+        sample = MuscleStream(ROBOT).take(message(unknown.rows), 0.0)
+        assert np.isnan(quantity.of(sample.newest)).all()
 
 
 def test_an_isolated_muscle_may_read_anything():
