@@ -149,9 +149,9 @@ class Parser(argparse.ArgumentParser):
 
     def add_workers(self) -> None:
         """Add `--jobs` and `--scheduler`, which say where independent parts of the work run."""
-        cores = len(os.sched_getaffinity(0))
-        text = 'number of processes on this machine'
-        self.add_argument('--jobs', type=whole(1, 256), default=cores, help=text)
+        text = 'number of processes on this machine (default: one for each core)'
+        self.add_argument('--jobs', type=whole(1, 256), help=text)
+        self.set_defaults(jobs=len(os.sched_getaffinity(0)))
         text = 'scheduler of a Dask cluster to use instead, such as tcp://192.168.0.2:8786'
         self.add_argument('--scheduler', metavar='ADDRESS', help=text)
 

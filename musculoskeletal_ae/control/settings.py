@@ -109,7 +109,8 @@ class Settings:
     )
     max_age: float = settable(
         INTERRUPTION,
-        'age of muscle_states or estimated_joint_states above which the arm stops',
+        'age of muscle_states or estimated_joint_states above which the arm pauses, and after a '
+        'further hold_time stops; `bringup.sh` sets 1.0 for emulated arms',
         's',
         0.01,
         10.0,
