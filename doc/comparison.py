@@ -196,7 +196,7 @@ def _emulated(results: Results) -> dict[str, list[float | None]]:
 
     emulated: dict[str, tuple[float, float | None]] = {
         'geometric model, least squares, without learning': (
-            after('geometric model, least squares'),
+            kin['least_squares_rad'],
             foreign['least_squares_rad'],
         ),
         'true routes and springs, least squares': (kin['oracle_rad'], foreign['oracle_rad']),
