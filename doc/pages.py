@@ -8,6 +8,7 @@ from musculoskeletal_ae.conditions import (
     stop_causes,
 )
 from musculoskeletal_ae.control import controller_status, supervisor
+from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.remedy_steps import Step
 
 STOPS = """\
@@ -26,6 +27,8 @@ stopped. [Recover from faults](../howto/recover_from_faults.md) has the commands
 {diagram}
 ```
 
+{modes}
+
 ## Causes
 
 A stop keeps the last command for `hold_time`. Then it pays out all muscles until each exerts \
@@ -35,7 +38,8 @@ T_bias. Modules that follow positions are paid out until their measured tension 
 Most causes last until `controller/reset`. The column *ends earlier* names those that also end by \
 themselves: by default, these are only short interruptions of readings or estimates. With \
 `on_anomaly: isolate`, a verification of a muscle ends those that the fault of this muscle caused. \
-All [findings](diagnostics.md#conditions) of the estimator lead to the cause `anomaly_detected`. \
+[Findings](diagnostics.md#conditions) of the estimator that stop the arm lead to the cause \
+`anomaly_detected`. \
 If several causes begin together, the first one in this table is reported. Each remedy ends with \
 `controller/reset`.
 
@@ -49,16 +53,35 @@ while these are present, except for the reset:
 
 {consequences}
 
+If several conditions are present, take each step once, in the order of its *place*: 0 removes a \
+cause, 1 calls estimator or learner, 2 resets the controller, 3 moves the arm, 4 learns again.
+
 {steps}
 
 `python doc/make.py` writes this page from the code.
 """
 
+#: what the arm does in each mode
+MODES = {
+    Activity.IDLE: 'has no target yet',
+    Activity.HOLDING: 'holds its target. A method that follows no trajectory (`geometric`, '
+    '`first`, `second`, `tension`; `proposed` of preset `paper`) has this mode also on the way',
+    Activity.MOVING: 'follows a trajectory',
+    Activity.EXPLORING: 'moves to random postures',
+    Activity.CALIBRATING: 'explores gently, because length offsets are unknown',
+    Activity.GRAVITY_COMPENSATION: 'is guided by hand, and only its weight is compensated '
+    '(`method: float`)',
+    StopState.PAUSED: 'keeps the last command, and continues when readings and estimates return',
+    StopState.STOPPED: 'is stopped until `controller/reset`, or until a suspect muscle is verified',
+    StopState.VERIFYING: 'is stopped; a suspect muscle is wound in',
+    StopState.RESUMING: 'is stopped; the muscle is verified, and the arm continues when no cause '
+    'is present',
+}
+
 
 def stops() -> str:
     """Return the page on modes, stop causes and steps."""
-    states = [state.value for state in supervisor.StopState]
-    states.remove(supervisor.StopState.RUNNING.value)
+    states = [state for state in StopState if state is not StopState.RUNNING]
     causes = [
         (
             f'`{kind.identifier}`',
@@ -69,8 +92,12 @@ def stops() -> str:
         for kind in stop_causes()
     ]
     return STOPS.format(
-        activities=_listed(activity.value for activity in supervisor.Activity),
-        states=_listed(states),
+        activities=_listed(activity.value for activity in Activity),
+        states=_listed(state.value for state in states),
+        modes=_table(
+            ('mode', 'the arm'),
+            [(f'`{mode.value}`', MODES[mode]) for mode in (*Activity, *states)],
+        ),
         at_once=_listed(kind.identifier for kind in stop_causes() if kind.releases_at_once),
         diagram=supervisor.diagram(),
         table=_table(('cause', 'condition', 'ends earlier', 'remedy'), causes),
