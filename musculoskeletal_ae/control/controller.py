@@ -317,6 +317,7 @@ class Controller:
     def _use_offsets(self, body: BodyState) -> None:
         before = self.stream.body.offsets
         self.limiter.shift(body.offsets.offset - before.offset)
+        self.stopping.shift(body.offsets.offset - before.offset)
         if self.sample is not None:
             self.sample = self.sample.shifted(body.offsets.offset - before.offset)
         is_known = body.offsets.known
@@ -385,13 +386,13 @@ class Controller:
         """Follow a trajectory through points, or come to rest and hold if there are none.
 
         Args:
-            points: The points; None to come to rest.
+            points: The points; None to come to rest now.
             delay: Time until the trajectory starts [s]; negative if it started in the past.
 
         Raises:
             MessageError: If the trajectory is refused; nothing is changed then.
         """
-        start, mae = self._ready(max(delay, 0.0))
+        start, mae = self._ready(0.0 if points is None else max(delay, 0.0))
         if points is None:
             self._follow(self.planner.to_rest(start))
         else:
@@ -521,9 +522,10 @@ class Controller:
         """
         # The rate limit applies to the time since the last publication. The time since the last
         # step is longer, because it also contains the computation of the last command.
-        computing = max(self.sent_at - self.watchdog.steps.stepped_at, 0.0)
+        steps = self.watchdog.steps
+        computing = min(steps.pace, 1.0) * max(self.sent_at - steps.stepped_at, 0.0)
         time = now if time is None else time
-        step = self.watchdog.steps.step(now, time, not self.supervisor.is_running)
+        step = steps.step(now, time, not self.supervisor.is_running)
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
             self.activities.entered, self._awaited_samples = None, WINDOW
         present = self.stop_conditions(now)
@@ -532,15 +534,17 @@ class Controller:
             self.supervisor.on_conditions(present, step.elapsed, self.stopping.is_releasing)
         fall = self.limiter.largest_change(TENSION, step.dt)
         self.watchdog.heat.lower(fall)
-        dt = max(step.dt - computing, 0.0)
+        dt, desired = max(step.dt - computing, 0.0), None
         if self.supervisor.is_running:
             self.stopping.leave()
             desired = None if present else self._desired(step.dt)
-            limited = self._limited(desired, dt)
+        if self.supervisor.is_running:  # the activity has not stopped the arm
+            # Without a desired command, the last one is repeated, and has to keep the limits, too.
+            limited = self._limited(desired or self.limiter.command, dt)
             if desired is not None and limited is None:
                 self.stop(ConditionKind.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
-            limited = self._limited(self._stopped(present, dt), dt)
+            limited = self._limited(self._stopped(present, step.dt), dt)
         held = self._held_posture
         self.holding.step(held, self.estimate, step.dt)
         self.resting_load.step(held, self.estimate, self._bone_tension, step.dt)
@@ -579,12 +583,11 @@ class Controller:
         the muscles can hold too few postures to explore, or cannot move the arm to the target, the
         activity ends without a stop.
         """
-        if self.estimate is None:  # wait for the next estimate, which a length calibration provides
-            self.activities.leave()
-            return self.limiter.command
         control = self.activities.of(self.supervisor.activity)
         known = self.stream.body.offsets.known
-        if control is None or not (known or control is self.activities.calibrating):
+        may_move = known or control is self.activities.calibrating
+        # Without an estimate, the arm waits for the next one, which a length calibration provides.
+        if control is None or self.estimate is None or not may_move:
             self.activities.leave()
             return None
         try:
@@ -731,7 +734,8 @@ class Controller:
     @property
     def _is_ready(self) -> bool:
         known = self.stream.body.offsets.known
-        return known and self.estimate is not None and self.mae is not None
+        has_network = self.estimate is not None and self.mae is not None
+        return known and has_network and not self.stop_conditions(self.watchdog.steps.stepped_at)
 
     def _ready(self, delay: float = 0.0) -> tuple[Setpoint, Mae]:
         """Return the setpoint from which a trajectory starts `delay` [s] from now, and the network.

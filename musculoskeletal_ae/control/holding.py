@@ -50,6 +50,7 @@ class HoldingCheck:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self.distance: Array | None = None
+        self._target: Array | None = None  # the last target [rad], (D,)
         self._away_time = 0.0  # time for which the arm has been away from its target [s]
         self._least = math.inf  # smallest distance since the end of the motion [rad]
 
@@ -58,10 +59,14 @@ class HoldingCheck:
 
         Without one of them, there is no distance, and the arm is not away from its target.
         """
+        is_same = target is self._target or (
+            target is not None and self._target is not None and (target == self._target).all()
+        )
+        self._target = target
         self.distance = None if target is None or theta is None else target - theta
-        if self.distance is None:
+        if not is_same or self.distance is None:
             self._least = math.inf
-        else:
+        if self.distance is not None:
             self._least = min(self._least, self.largest)
         is_away = self.largest > min(AWAY, self._least + CARRIED)
         self._away_time = self._away_time + dt if is_away else 0.0

@@ -82,6 +82,7 @@ class CommandLimiter:
     Attributes:
         command: The last published command, or None.
         slack_length: Commanded length at which each muscle is slack in any posture [m], (M,).
+        span: By how much `slack_length` exceeds the shortest length of each muscle [m], (M,).
         offsets_known: Whether the length offsets are known.
     """
 
@@ -98,8 +99,9 @@ class CommandLimiter:
         self._exceeded: Array = np.full(robot.muscle_count, -np.inf)
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
-        longest = robot.routes.relative_lengths(postures).max(axis=0)
-        self.slack_length: Array = longest + LARGEST
+        lengths = robot.routes.relative_lengths(postures)
+        self.slack_length: Array = lengths.max(axis=0) + LARGEST
+        self.span: Array = self.slack_length - lengths.min(axis=0)
 
     @property
     def longest(self) -> Array:
@@ -157,6 +159,7 @@ class CommandLimiter:
         """Return length commands [m], (M,), that demand given tensions [N], (M,).
 
         If several lengths demand a tension, the one nearest to the last published length is chosen.
+        The lengths are not shorter than the rate limit permits since that length.
         """
         robot = self._setup.robot
         demand = np.maximum(tension, robot.tension.bias)
@@ -165,8 +168,7 @@ class CommandLimiter:
             return length
         before, age = self._last_length
         length = np.where(demand > robot.tension.bias, length, np.maximum(length, before))
-        change = self.largest_change(LENGTH, age)
-        return np.clip(length, before - change, before + change)
+        return np.maximum(length, before - self.largest_change(LENGTH, age))
 
     def largest_change(self, kind: str, dt: float) -> Array:
         """Return the largest change within dt [s] of a length command [m] or tension command [N].
@@ -202,10 +204,13 @@ class CommandLimiter:
             The limited command. None if it is not finite; the last command then stays valid.
         """
         actuation = self._setup.robot.actuation
-        if desired.kind == TENSION:
-            length, tension = sample.length, sample.motor_tension
-            desired = Command(*actuation.command_for(length, tension, desired.value))
         kind = desired.kind
+        if kind == TENSION:
+            length, tension = sample.length, sample.motor_tension
+            kind, value = actuation.command_for(length, tension, desired.value)
+            if kind == LENGTH:  # readings of isolated muscles may be wrong
+                value = np.where(self._setup.robot.used, value, self.slack_length)
+            desired = Command(kind, value)
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
         value = np.clip(desired.value, before - change, before + change)

@@ -118,7 +118,8 @@ class Settings:
     hold_time: float = settable(
         0.5,
         'time for which a stop holds the last command; if only data is missing and it returns '
-        'within this time, the arm resumes',
+        'within this time, the arm resumes its target; with more than 5 s, the verification of an '
+        'isolated muscle ends before the muscle is wound in',
         's',
         0.0,
         60.0,

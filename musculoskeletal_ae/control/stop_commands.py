@@ -41,8 +41,16 @@ class SafeStop:
     def leave(self) -> None:
         """End the stop, and forget its duration and the lengths at which its release began."""
         self._held = 0.0  # duration of the stop [s]; excludes the time of waiting to resume
-        self._wound_from: float | None = None  # suspect's command before it was wound in [m]
+        #: commands before the suspect was wound in [m], (M,)
+        self._wound_from: Array | None = None
         self._released_from: Array | None = None  # lengths at the start of the release [m], (M,)
+
+    def shift(self, offset: Array) -> None:
+        """Shift stored lengths to new length offsets, which are larger by `offset` [m], (M,)."""
+        if self._released_from is not None:
+            self._released_from = self._released_from - offset
+        if self._wound_from is not None:
+            self._wound_from = self._wound_from - offset
 
     @property
     def is_releasing(self) -> bool:
@@ -87,16 +95,15 @@ class SafeStop:
         change = self._limiter.largest_change(LENGTH, dt)
         if self._released_from is None:
             self._released_from = np.maximum(last.value, sample.length)
+        # Wherever the arm is, a muscle is slack once it has been paid out by its whole range.
+        slack = np.minimum(self._limiter.longest, self._released_from + self._limiter.span)
         end = self._setup.robot.actuation.released(
-            last.value,
-            self._released_from,
-            sample.length,
-            sample.motor_tension,
-            self._limiter.longest,
-            is_fresh,
+            last.value, self._released_from, sample.length, sample.motor_tension, slack, is_fresh
         )
         value = np.minimum(last.value + change, np.maximum(end, last.value))
         if winds and suspect is not None:
+            if self._wound_from is None:
+                self._wound_from = last.value
             value[suspect] = self._wound(suspect, float(last.value[suspect]), sample, dt)
         return Command(LENGTH, value)
 
@@ -111,10 +118,10 @@ class SafeStop:
             sample: The newest muscle states.
             dt: Time since the last command [s].
         """
-        if self._wound_from is None:
-            self._wound_from = command
+        assert self._wound_from is not None
         length, tension = sample.newest.length[muscle], sample.newest.tension[muscle]
         actuation = self._setup.robot.actuation
         if actuation.rise(muscle, length, command, tension) > LARGEST_RISE:
             return command
-        return max(command - SPEED * dt, self._wound_from - actuation.winding_depth(muscle))
+        least = float(self._wound_from[muscle]) - actuation.winding_depth(muscle)
+        return max(command - SPEED * dt, least)

@@ -94,8 +94,12 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
 
 
 def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
-    """Return a command that keeps the present tensions; `kind` is `LENGTH` or `TENSION`."""
-    tension = np.maximum(sample.motor_tension, robot.tension.bias)
+    """Return a command that keeps the present tensions; `kind` is `LENGTH` or `TENSION`.
+
+    An isolated muscle, whose reading may be wrong, is commanded to exert T_bias.
+    """
+    present = np.maximum(sample.motor_tension, robot.tension.bias)
+    tension = np.where(robot.used, present, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
     return Command(LENGTH, sample.length + msc_compensation(robot, tension))

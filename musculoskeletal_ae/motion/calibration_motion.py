@@ -67,7 +67,8 @@ class Calibrating(ActivityControl):
     def step(self, inputs: Inputs) -> Command | None:
         """Advance by one control step and return the next length command."""
         if self._ramp is None or (self._ramp.done and self._rested >= REST):
-            speed = float(self._setup.robot.actuation.fastest(SPEED).min())
+            rate = min(SPEED, self._setup.settings.rate_limit)
+            speed = float(self._setup.robot.actuation.fastest(rate).min())
             self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, speed)
             self._rested = 0.0
         if self._ramp.done:

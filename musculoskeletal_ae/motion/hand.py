@@ -17,13 +17,13 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.holdable_paths import lacking, nearest_held
 from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
-from musculoskeletal_ae.robot.robot import Robot
 
 #: end the search of the inverse kinematics within these distances [m] and angles [rad]: WHOLE for
 #: position and orientation, POSITION for the position alone, with which any orientation is legal
@@ -51,8 +51,8 @@ DAMPING = 0.02
 class Hand:
     """Converts commanded poses and twists of the hand into trajectories of the joints."""
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
         #: time [s], position [m] and posture θ [rad] of the last pose
         self._last: tuple[float, Array, Array] | None = None
         self._interval = 0.0  # average time between the poses of a path [s]; 0 if there is no path
@@ -76,7 +76,7 @@ class Hand:
         Raises:
             MessageError: If the hand cannot reach or hold the pose and `nearest` is false.
         """
-        robot = self._robot
+        robot = self._setup.robot
         theta, distance, angle, _ = inverse_kinematics(
             robot, pose, start, WHOLE if whole else POSITION
         )
@@ -104,7 +104,7 @@ class Hand:
             theta: Posture in which the hand has the pose, θ [rad], (D,).
             now: Time at which the pose was received [s].
         """
-        robot, last = self._robot, self._last
+        robot, last = self._setup.robot, self._last
         here = robot.kinematics.end_effector_pose(start.theta).translation
         where = robot.kinematics.end_effector_pose(theta).translation
         self._last = now, where, theta
@@ -147,7 +147,7 @@ class Hand:
         Raises:
             MessageError: If the muscles cannot hold the arm at the end of the motion.
         """
-        robot = self._robot
+        robot = self._setup.robot
         jacobian = robot.kinematics.end_effector_jacobian(start.theta)
         rows = slice(0, 6 if twist[3:].any() else 3)
         part = jacobian[rows]

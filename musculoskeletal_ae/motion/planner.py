@@ -39,7 +39,7 @@ class Planner:
     """Plans trajectories with the network in use."""
 
     def __init__(self, setup: Setup) -> None:
-        self._setup, self._hand = setup, Hand(setup.robot)
+        self._setup, self._hand = setup, Hand(setup)
         #: the last pose, whether its orientation counts, and the trajectory to it
         self._last_pose: tuple[pin.SE3, bool, Trajectory] | None = None
 

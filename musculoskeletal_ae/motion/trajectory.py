@@ -40,6 +40,10 @@ AT_ONCE = 0.01
 #: Refuse two successive times that are closer than this, relative to the later one: in a shorter
 #: piece of the curve, rounding errors of the time would matter.
 RESOLUTION = 1e-11
+#: Skip points, except the last, that a trajectory which began in the past would have to reach in
+#: less time than it is late, or than this [s]. Otherwise a point that is due at once would slow the
+#: whole trajectory down.
+JOINING = 0.1
 # Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
 # and acceleration at both ends.
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
@@ -122,7 +126,8 @@ class Trajectory:
     def through(cls, start: Setpoint, points: TrajectoryPoints, passed: float = 0.0) -> Trajectory:
         """Return the trajectory from `start` through the points that are still ahead.
 
-        A single point at time 0 is reached as fast as possible.
+        Of a trajectory that began in the past, points that are due too soon are skipped, too. A
+        single point at time 0 is reached as fast as possible.
 
         Args:
             start: Setpoint at which the trajectory begins.
@@ -132,7 +137,8 @@ class Trajectory:
         Raises:
             MessageError: If no point remains, or two points are too close in time.
         """
-        kept = points.time > passed + 1e-9
+        kept = points.time > passed + min(passed, JOINING) + 1e-9
+        kept[-1] = points.time[-1] > passed + 1e-9
         # If all points are at time 0, they are requested after AT_ONCE instead. The planner then
         # slows the trajectory as far as necessary.
         if not kept.any() and passed == 0.0:

@@ -86,8 +86,9 @@ class FollowJointTrajectory:
         self._handle, self._goal = handle, self._requested
         handle.execute()
 
-    def _cancel(self, _: Any) -> CancelResponse:
-        self._rest()
+    def _cancel(self, handle: Any) -> CancelResponse:
+        if handle is self._handle:  # not a goal that another one has just replaced
+            self._rest()
         return CancelResponse.ACCEPT
 
     def _rest(self) -> None:

@@ -5,7 +5,7 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
-from control_bench import DT, OTHER, REST, ROBOT, Bench, settled, values
+from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, settled, values
 from exact_mae import ExactMae, rest_readings
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -571,3 +571,49 @@ def test_a_reset_ends_a_stop_by_late_data_at_once():
     bench.step(2)
     assert bench.core.reset(bench.now) is None
     assert bench.core.supervisor.mode != 'paused'
+
+
+@pytest.mark.parametrize('method', ['proposed', 'first', 'tension'])
+def test_an_arm_without_a_target_gives_way_to_a_push(method):
+    bench = settled(method=method)
+    bench.core.explore(True)
+    bench.step(5)
+    bench.core.explore(False)
+    bench.step(5)
+    for share in np.linspace(0.0, 1.0, 50):
+        bench.theta = REST + share * np.array([0.5, 0.6])
+        bench.step()
+    sent, length = bench.step(100)[-1], bench.core.sample.length
+    assert (demanded(sent, length) <= ROBOT.tension.limit + 1e-6).all()
+
+
+def demanded(command, length):
+    """Return the tensions [N] that a command demands of modules at the lengths `length` [m]."""
+    by_length = command.kind == LENGTH
+    return ROBOT.actuation.demanded(length, command.value) if by_length else command.value
+
+
+def test_a_target_before_the_first_command_is_kept_while_estimates_are_late():
+    bench = Bench()
+    bench.step(3)
+    bench.blind = {'estimate'}
+    bench.step(40)
+    bench.target(OTHER)
+    bench.blind = set()
+    sent = bench.step(30)
+    assert any(command is not None for command in sent)
+    np.testing.assert_allclose(bench.core.target_state.theta, OTHER)
+
+
+def test_an_operator_stop_releases_the_arm_although_the_clock_is_slow_and_the_computer_busy():
+    bench = settled(method='proposed')
+    core, time = bench.core, bench.now
+    bench.stop()
+    for _ in range(1000):  # 15 s on the steady clock, 3 s on the clock of the messages
+        bench.now += 0.015
+        time += 0.2 * 0.015
+        bench.send(np.array([*rest_readings(ROBOT, REST), COLD]))
+        core.estimated(REST, bench.now)
+        sent = core.step(bench.now, time)
+        core.sent_at = bench.now + 0.012
+    assert demanded(sent, core.sample.length) == pytest.approx(ROBOT.tension.bias, abs=1.0)

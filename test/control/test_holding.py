@@ -63,3 +63,10 @@ def test_friction_and_wanted_torques_are_no_reason_to_warn():
     bench.target(REST + 1.4 * AWAY, effort=(1.0, 0.0))
     bench.step(round(2.0 * LASTING / SELDOM))
     assert 'not at its target' not in bench.report().message
+
+
+def test_a_new_target_begins_a_new_distance_with_tension_commands_as_well():
+    bench = resting(np.array([0.0, 0.01]), method='tension')
+    bench.target(REST + np.array([0.0, 0.01 + 1.2 * CARRIED]))
+    bench.step(round(2.0 * LASTING / SELDOM))
+    assert 'not at its target' not in bench.report().message

@@ -702,3 +702,26 @@ def test_the_simulator_gives_an_isolated_muscle_no_tension(trained, preset):
     assert (state.tension[0, USED] >= 30.0).all()
     arm.isolate([])
     assert arm.step(0.01).tension[0, LOST] >= 30.0
+
+
+@pytest.mark.parametrize('has_paused', [False, True])
+def test_a_wrong_reading_of_an_isolated_muscle_does_not_make_it_pull(has_paused):
+    bench = Bench()
+    bench.isolate([LOST])
+    bench.tension = np.where(USED, ROBOT.tension.bias, 450.0)
+    bench.target(REST)
+    if has_paused:
+        bench.step(100)
+        bench.now += 2.0
+    for command in filter(None, bench.step(100)):
+        demand = ROBOT.actuation.demanded(bench.core.sample.length, command.value)
+        assert demand[LOST] <= ROBOT.tension.bias[LOST] + 1e-6
+
+
+def test_a_twist_to_a_posture_that_the_others_cannot_hold_is_refused():
+    bench = Bench()
+    bench.theta = np.array([-0.13, -0.58])
+    bench.isolate([LOST])
+    bench.step(5)
+    with pytest.raises(MessageError, match='the muscles lack'):
+        bench.core.twist(np.array([0.25, 0.0, -0.25, 0.0, 0.0, 0.0]))

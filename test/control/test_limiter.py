@@ -188,3 +188,16 @@ def test_the_unchanging_command_demands_the_present_tension(tension, length):
     pull = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
     np.testing.assert_allclose(pull, np.maximum(tension, BIAS))
     np.testing.assert_array_equal(unchanging(ROBOT, TENSION, now).value, np.maximum(tension, BIAS))
+
+
+@pytest.mark.parametrize('rate', [0.1, 0.005])
+def test_lengths_after_tensions_demand_no_step_although_the_arm_was_led_elsewhere(rate):
+    limiter = CommandLimiter(Setup(ROBOT, Settings(rate_limit=rate)))
+    ends = ROBOT.routes.relative_lengths(np.array([[-0.3, -1.0], [0.6, -0.2]]))
+    limiter.limit(Command(LENGTH, ends[0]), sample(ends[0], BIAS), LIMIT, DT)
+    for share in np.linspace(0.0, 1.0, 200):
+        now = sample((1.0 - share) * ends[0] + share * ends[1], BIAS)
+        limiter.limit(Command(TENSION, ROBOT.tension.bias), now, LIMIT, DT)
+    sent = limiter.limit(Command(LENGTH, now.length), now, LIMIT, DT).value
+    most = BIAS + ROBOT.stiffness * rate * DT + 1e-6
+    assert (ROBOT.actuation.demanded(now.length, sent) <= most).all()

@@ -214,3 +214,16 @@ def test_gravity_compensation_follows_a_hand():
     loop.arm.set_wrench(np.zeros(6))
     loop.wait(1.0)
     assert np.abs(loop.arm.theta - before).max() > 0.2
+
+
+@pytest.mark.parametrize('read', [0.0, 150.0])
+def test_a_method_that_wants_tensions_keeps_an_isolated_muscle_slack_whatever_it_reads(read):
+    robot = ROBOT.without([1])
+    limiter = CommandLimiter(Setup(robot, Settings()))
+    tension = np.where(robot.used, BIAS, read)
+    limiter.command = Command(LENGTH, np.zeros(COUNT))
+    for _ in range(1000):
+        now = sample(0.0, tension, robot)
+        desired = Command(TENSION, np.where(robot.used, BIAS, 0.0))
+        sent = limiter.limit(desired, now, LIMIT, DT).value
+    assert sent[1] == pytest.approx(limiter.slack_length[1])

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion while the length offsets are unknown: only exploration, with gentle limits."""
 
+from dataclasses import replace
+from itertools import groupby
+
 import numpy as np
 import pytest
 
@@ -115,3 +118,12 @@ def test_a_length_calibration_moves_the_arm_only_after_its_first_estimate_even_a
     loop.has_estimates = True
     loop.run(0.5)
     assert np.abs(loop.commands[-1] - before).max() > 0.001
+
+
+def test_with_a_small_rate_limit_the_arm_rests_nevertheless(loop):
+    loop.core.configure(replace(loop.core.settings, rate_limit=0.005))
+    loop.core.explore(True)
+    loop.run(40.0)
+    still = (np.diff(loop.commands, axis=0) == 0.0).all(axis=1)
+    longest = max(sum(1 for _ in run) for is_still, run in groupby(still) if is_still)
+    assert longest * DT >= 0.2

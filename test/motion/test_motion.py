@@ -29,7 +29,7 @@ from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.holdable_paths import NOTABLE, PathLimits
 from musculoskeletal_ae.motion.methods import StiffnessModel
 from musculoskeletal_ae.motion.slowness import BRAKING, SHARE, _eased, slowed_to_exert, slowness
-from musculoskeletal_ae.motion.trajectory import Setpoint, Slowdown, Trajectory
+from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Slowdown, Trajectory
 from musculoskeletal_ae.motion.winches import Winches
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -499,7 +499,7 @@ def test_a_hand_pose_that_the_muscles_cannot_hold_is_refused(bench, monkeypatch)
     monkeypatch.setattr(bench.mae, 'muscle_jacobian', weak, raising=False)
     with pytest.raises(MessageError, match='the muscles lack'):
         hand(bench, OTHER)
-    theta, short = Hand(ROBOT).posture(
+    theta, short = Hand(Setup(ROBOT, Settings())).posture(
         bench.mae, ROBOT.kinematics.end_effector_pose(OTHER), False, REST, True
     )
     assert 'the muscles lack' in short
@@ -613,3 +613,24 @@ def test_a_point_just_beyond_the_tolerance_of_a_limit_is_refused_in_numbers_that
     with pytest.raises(MessageError) as error:
         bench.core.trajectory(points(beyond))
     assert len(set(re.findall(r'-?\d+\.\d+', str(error.value)))) == 3
+
+
+def test_an_empty_trajectory_stops_the_arm_at_once_whatever_its_stamp(bench):
+    bench.core.trajectory(points(OTHER, 2.0))
+    moved(bench, 80)
+    before = bench.follower.progress.desired
+    bench.core.trajectory(None, delay=1.0)
+    moved(bench, 1)
+    step = np.abs(bench.follower.progress.desired.theta - before.theta).max()
+    assert step <= 1.5 * DT * np.abs(before.velocity).max()
+    moved(bench, 40)
+    way = np.abs(bench.follower.progress.desired.theta - before.theta)
+    assert (way <= 0.5 * STOPPING * np.abs(before.velocity) + 1e-3).all()
+
+
+@pytest.mark.parametrize('late', [0.1, 0.1099, 0.10999])
+def test_a_trajectory_that_is_a_little_late_takes_little_longer(bench, late):
+    time = np.arange(0.01, 2.005, 0.01)
+    path = REST + time[:, None] / 2.0 * (OTHER - REST)
+    bench.core.trajectory(TrajectoryPoints(np.array([0, 1]), time, path, None, None), delay=-late)
+    assert bench.follower.progress.trajectory.duration < 4.0
