@@ -100,9 +100,11 @@ class HealthyTorque:
             torque: Estimated external torques at the joints [N·m], (D,).
             velocity: Joint velocities [rad/s], (D,).
             damping: Damping of the joints that this estimate assumed [N·m·s/rad], (D,).
-            dt: Time since the previous message [s].
+            dt: Time since the previous message [s]. A mean over time does not change in a step of
+                0 s, as between two messages with the same time on /clock.
         """
-        if not self._is_measuring or np.linalg.norm(velocity) < MOVING:
+        is_moving = dt > 0.0 and np.linalg.norm(velocity) >= MOVING
+        if not self._is_measuring or not is_moving:
             return
         spread = np.where(self._time > LEAST_MOTION, np.sqrt(self._means[0]), np.inf)
         square = np.minimum(torque**2, (OUTLIER * spread) ** 2)

@@ -234,6 +234,18 @@ def test_a_joint_at_its_stop_takes_the_residual_torque_of_the_others(robot, mae)
     np.testing.assert_array_equal(at_stop.elasticity.damping[1], 0.0)
 
 
+def test_two_messages_of_the_same_time_leave_a_joint_at_its_stop_unmeasured(robot, mae):
+    core = HealthyTorque(robot)
+    core.put_into(unmeasured(mae))
+    at_stop, velocity = np.array([0.2, 0.0]), np.array([0.3, 0.0])
+    for dt in (DT, 0.0, DT):
+        core.step(at_stop, velocity, np.zeros(2), dt)
+    swing(core, unmeasured(mae), LEAST_MOTION + 2.0)
+    touch = core.put_into(unmeasured(mae)).touch
+    assert touch.calibrated
+    assert np.isfinite(touch.spread).all()
+
+
 def test_nothing_is_measured_until_the_friction_of_the_tendons_is_known(robot, mae):
     core = HealthyTorque(robot)
     swing(core, replace(mae, touch=None), 100.0, true=(5.0, 5.0))
