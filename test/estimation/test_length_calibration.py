@@ -135,6 +135,22 @@ def test_length_offsets_are_found_from_a_stated_posture_if_the_arm_stands(robot,
     np.testing.assert_allclose(calibration.offsets.offset, OFFSET, atol=1e-3)
 
 
+@pytest.mark.parametrize('is_standing', [True, False])
+def test_an_offset_that_no_node_would_use_is_refused_with_its_muscle_and_the_remedy(
+    robot, mae, moment, is_standing
+):
+    theta, tension, length = moment(3.0)
+    far = length + 12.0 * (np.arange(6) == 4)
+    posture = tuple(theta.tolist()) if is_standing else ()
+    calibration = LengthCalibration(robot, mae, posture)
+    calibration = run(calibration, lambda _: (theta, tension, far), 2.0, sees=True)
+    assert not calibration.is_done and calibration.offsets is None
+    problem = (
+        rf'{robot.muscles[4]} has an offset of 12\.\d m; legal: .*10 m; .* estimator/zero again'
+    )
+    assert re.search(problem, calibration.problem)
+
+
 def test_a_standing_arm_does_not_determine_the_length_offsets(robot, mae, moment):
     calibration = run(LengthCalibration(robot, mae), lambda _: moment(3.0), 3.0, sees=False)
     assert calibration.offsets is not None and not calibration.offsets.known

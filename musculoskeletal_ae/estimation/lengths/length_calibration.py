@@ -34,7 +34,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
+from musculoskeletal_ae.signals.body_state import MOST_OFFSET, UNKNOWN, LengthOffsets
 from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 
 ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
@@ -298,9 +298,13 @@ class LengthCalibration:
         of_isolated = np.clip(of_isolated, -FARTHEST, FARTHEST)
         offset = np.where(used, fit.constants[:muscle_count], of_isolated)
         offset = self._fit.with_known(offset)
+        self._problem = self._impossible_offset(offset)
+        if self._problem:  # no node would use such an offset, not even provisionally
+            self._estimate = None
+            return
         error = used * (moments.length - offset - expected)
         residual = np.median(np.abs(error), axis=0)
-        self._best, self._problem = fit, ''
+        self._best = fit
         deviation = np.full(muscle_count, UNKNOWN)
         if is_enough:
             self._problem = self._problem_of(fit, residual)
@@ -310,6 +314,17 @@ class LengthCalibration:
                 deviation = MAD_TO_DEVIATION * residual / np.sqrt(independent)
                 deviation[~used] = LARGEST_RESIDUAL
         self._estimate = LengthOffsets(offset, deviation)
+
+    def _impossible_offset(self, offset: Array) -> str:
+        """Return for users which offset is too large to be used, or '' if none is."""
+        muscle = int(np.abs(offset).argmax())
+        if abs(offset[muscle]) <= MOST_OFFSET:
+            return ''
+        return (
+            f'the length of {self._robot.muscles[muscle]} has an offset of {offset[muscle]:.1f} m; '
+            f'legal: within ±{MOST_OFFSET:g} m; let the driver count from a zero near the arm, and '
+            'call estimator/zero again'
+        )
 
     def _contradicts_known(self, error: Array) -> bool:
         """Return whether the fit is bad, or a known offset is off.
