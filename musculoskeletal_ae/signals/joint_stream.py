@@ -9,7 +9,8 @@ since its previous reading, limited to `LIMITS.longest_step`. Single impossible 
 or −π, and bursts of them are therefore not usable. Each joint is judged by itself, so that a bad
 sensor does not affect the readings of the others. However, if at least half of the readings in a
 message are impossible, no reading in it is usable: the message then describes another posture, for
-example that of another program.
+example that of another program. The other sensors of this message are not blamed for it, because
+half of the sensors may as well be broken.
 
 The level of a sensor changes if the sensor slips on its axis. The new level is accepted after all
 readings have followed each other plausibly for `LIMITS.settled`. This file cannot say which level
@@ -135,8 +136,13 @@ class JointChannel:
         return JointReading.JUMPED
 
     def note(self, time: float, value: float, kind: JointReading) -> None:
-        """Note a reading [rad] received at `time` [s], and how it was judged in the end."""
+        """Note a reading [rad] received at `time` [s], and how it was judged in the end.
+
+        A reading that is not usable only because of the others says nothing about this sensor.
+        """
         series = self.series
+        if kind is JointReading.FOREIGN:
+            return
         if kind is JointReading.USABLE:
             self._accepted = value
             if series is not _NONE and series.is_present(time):

@@ -118,6 +118,16 @@ def test_a_message_of_which_most_readings_are_impossible_is_not_used_at_all():
     assert stream.rejected[robot.joints[0], JointReading.FOREIGN] == 50
 
 
+def test_only_the_broken_sensors_are_named_if_half_of_all_are_broken():
+    robot = Robot.load('musashi_left_arm')
+    stream = JointStream(robot)
+    theta = np.array([0.05, -0.4, 0.3, -1.0, 0.4])
+    for step in range(400):
+        broken = np.where((np.arange(5) >= 2) & (step >= 100), 9.0, theta)
+        stream.take(PERIOD * step, broken)
+    assert set(stream.impossible(PERIOD * step)) == {2, 3, 4}
+
+
 def test_a_joint_that_had_readings_is_missing_after_a_second_without_one(robot):
     stream = JointStream(robot)
     named = []
