@@ -137,7 +137,7 @@ class LengthDisagreement(Detector):
     def reset(self) -> None:
         """Reset the detector: discard messages of the last second, keep healthy messages."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
-        self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
+        self._since, self._beyond = 0.0, 0.0
         self._gap = None
 
     def forget(self) -> None:
@@ -165,14 +165,12 @@ class LengthDisagreement(Detector):
         self._since += observation.dt
         if self._since < SPACING - 1e-9 or self._mae is None:
             return None
-        dt, self._since = self._since, 0.0
-        if observation.measured is None:
-            self._unmeasured += dt
-            if self._unmeasured > COUNT * SPACING:  # earlier values are out of date
+        if observation.measured is None:  # compare as soon as there is a fresh reading again
+            if self._since > (COUNT + 1) * SPACING:  # earlier values are out of date
                 self._recent.clear()
                 self._gap, self._beyond = None, 0.0
             return None
-        self._unmeasured = 0.0
+        dt, self._since = self._since, 0.0
         sample, theta = observation.sample, observation.measured
         self._recent.append(sample.length - self._mae.lengths(theta, sample.bone_tension))
         if len(self._recent) < COUNT:
