@@ -5,6 +5,8 @@ The readings of a working sensor contain noise. Therefore a constant reading is 
 hardly disturbs the estimate. The other muscles show whether the muscle moves.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
@@ -23,10 +25,27 @@ NOISY, ENOUGH = 0.9, 1000
 MOVED = 0.006
 
 
+@dataclass
+class _Observed:
+    """A muscle with a constant reading, and its lengths that the other muscles have shown so far.
+
+    Attributes:
+        mae: The network without this muscle.
+        shortest: Its shortest predicted length [m].
+        longest: Its longest predicted length [m].
+    """
+
+    mae: Mae
+    shortest: float = np.inf
+    longest: float = -np.inf
+
+
 class FrozenSensor(Detector):
     """Reports a muscle whose length or tension reading is constant although the muscle moves.
 
-    The lengths of the other muscles show whether it moves.
+    The lengths of the other muscles show whether it moves. If several muscles have constant
+    readings, as sound sensors without noise have at a standing winch, each message examines the
+    next of them, so that no message takes longer to check.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -39,20 +58,19 @@ class FrozenSensor(Detector):
         #: same, in which it changed, and in which it has stayed the same since the last change,
         #: (3, M)
         self._near_bias: Array = np.zeros((3, robot.muscle_count))
-        self._reduced_mae: Mae | None = None  # network without the observed muscle
-        #: shortest and longest predicted length of the observed muscle [m]
-        self._shortest, self._longest = np.inf, -np.inf
+        self._observed: dict[int, _Observed] = {}  # muscles with constant readings, by index
+        self._examined = -1  # index of the muscle that was examined last
 
     def use(self, mae: Mae) -> None:
         """Use another network to predict lengths; its isolated muscles are ignored."""
         self._mae = mae
-        self._stop_observing()
+        self._observed = {}
 
     def reset(self) -> None:
         """Reset the detector: measure anew how long readings have been constant."""
         self._last = None
         self._unchanged_time[:] = 0.0
-        self._stop_observing()
+        self._observed = {}
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose reading is constant although the muscle moves.
@@ -76,7 +94,7 @@ class FrozenSensor(Detector):
         self._last = readings
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same
         if self._unchanged_time.max() < FROZEN_TIME or mae is None or not mae.is_calibrated:
-            self._stop_observing()
+            self._observed = {}
             return None
         # Slack tendons are left to `slack_tendon.py`. A constant tension of T_bias is no fault of a
         # simple module that always reports exactly T_bias.
@@ -84,25 +102,22 @@ class FrozenSensor(Detector):
         has_noise = (same + changed >= ENOUGH) & (changed > NOISY * (same + changed))
         time = np.maximum(by_length, by_tension * (~is_near_bias | has_noise))
         time = time * (sample.usable & (tension > slack))
-        muscle = int(time.argmax())
-        if time[muscle] < FROZEN_TIME or not observation.lengths_known:
-            self._stop_observing()
+        constant = np.flatnonzero(time >= FROZEN_TIME).tolist() if observation.lengths_known else []
+        self._observed = {m: each for m, each in self._observed.items() if m in constant}
+        if not constant:
             return None
-        isolated = tuple(sorted((*mae.isolated, muscle)))
-        if self._reduced_mae is None or self._reduced_mae.isolated != isolated:
-            self._stop_observing()
-            self._reduced_mae = mae.without(isolated)
-        theta = self._reduced_mae.estimate(sample.bone_tension, sample.length).theta
+        muscle = next((m for m in constant if m > self._examined), constant[0])
+        self._examined = muscle
+        if muscle not in self._observed:
+            self._observed[muscle] = _Observed(mae.without((*mae.isolated, muscle)))
+        observed = self._observed[muscle]
+        theta = observed.mae.estimate(sample.bone_tension, sample.length).theta
         pull = np.minimum(sample.bone_tension, robot.tension.limit) * sample.usable
-        predicted = float(self._reduced_mae.lengths(theta, pull)[muscle])
-        self._shortest = min(predicted, self._shortest)
-        self._longest = max(predicted, self._longest)
-        if self._longest - self._shortest <= MOVED:
+        predicted = float(observed.mae.lengths(theta, pull)[muscle])
+        observed.shortest = min(predicted, observed.shortest)
+        observed.longest = max(predicted, observed.longest)
+        if observed.longest - observed.shortest <= MOVED:
             return None
         quantity = 'length' if by_length[muscle] >= FROZEN_TIME else 'tension'
         evidence = f'its {quantity} reading stays exactly the same while the arm moves'
         return Finding(muscle, ConditionKind.SENSOR_FROZEN, evidence)
-
-    def _stop_observing(self) -> None:
-        self._reduced_mae = None
-        self._shortest, self._longest = np.inf, -np.inf
