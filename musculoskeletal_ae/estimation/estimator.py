@@ -18,7 +18,7 @@ describes the sequence from a rupture to resuming.
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import pinocchio as pin
@@ -331,13 +331,8 @@ class Estimator:
                 still contradict the rest of the arm (`repair_check`). No muscle is restored then.
         """
         restored = [muscle for muscle in self.body.isolated if muscle in set(muscles)]
-        verified = self.body.verified
-        if verified is not None and verified in restored:
-            raise MusculoskeletalError(
-                f'{self.robot.muscles[verified]} is being verified; this ends by itself '
-                f'within {LONGEST:g} s; wait until then, and call estimator/restore again if the '
-                'muscle is still isolated'
-            )
+        if self.suspects.verified in restored:
+            self._refuse_verified('restore', 'if the muscle is still isolated')
         self._refuse_unrepaired(restored, 'restore')
         self._note_checked(restored)
         if self.calibration is not None:  # the lengths of these muscles were not checked meanwhile
@@ -351,13 +346,17 @@ class Estimator:
             isolating: Muscles (indices) that are isolated in addition; they need not be healthy.
 
         Raises:
-            MusculoskeletalError: If the readings of the suspect muscle still contradict the rest of
-                the arm (`repair_check`), or if length offsets were revoked, which only a length
-                calibration ends. The anomaly then stays.
+            MusculoskeletalError: If a suspect muscle that is not in `isolating` is being verified,
+                or its readings still contradict the rest of the arm (`repair_check`), or if length
+                offsets were revoked, which only a length calibration ends. The anomaly then stays.
         """
         isolating = tuple(isolating)
+        verified = self.suspects.verified
+        if verified is not None and verified not in isolating:
+            service = 'isolate' if isolating else 'reset'
+            self._refuse_verified(service, 'if the anomaly is still present')
         suspected = self._suspected(isolating)
-        self._refuse_unrepaired(suspected, 'reset')
+        self._refuse_unrepaired(suspected, 'isolate' if isolating else 'reset')
         self._note_checked(suspected)
         if self.body.offsets.revoked:
             raise MusculoskeletalError(f'{self.cause}; {self.advice}')
@@ -624,6 +623,22 @@ class Estimator:
         """Note that lengths which changed in a repair have been checked."""
         moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
         self._note(Evidence.CHECKED, moved)
+
+    def _refuse_verified(self, service: str, condition: str) -> NoReturn:
+        """Refuse a service that would end the verification of the suspect without a verdict.
+
+        Args:
+            service: Name of the service without `estimator/`.
+            condition: When to call it again, as a text for users.
+
+        Raises:
+            MusculoskeletalError: The text says how long to wait.
+        """
+        assert self.suspects.verified is not None
+        raise MusculoskeletalError(
+            f'{self.robot.muscles[self.suspects.verified]} is being verified; this ends by itself '
+            f'within {LONGEST:g} s; wait until then, and call estimator/{service} again {condition}'
+        )
 
     def _refuse_unrepaired(
         self,

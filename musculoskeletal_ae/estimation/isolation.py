@@ -34,7 +34,8 @@ A muscle may be repaired while its finding is latched, and the repair may make i
 its winch may take seconds to come to rest. A wrong length of this muscle alone therefore neither
 replaces the finding nor revokes its length offset (`Evidence.MOVED`). `Estimator.reset` checks
 whether the length agrees with the rest of the arm, and so does `Estimator.restore` for isolated
-muscles. While a muscle is being verified, it cannot be restored.
+muscles. While a muscle is being verified, it cannot be restored, and the anomaly can only be ended
+by isolating this muscle or by a length calibration.
 """
 
 from collections.abc import Iterable
@@ -175,7 +176,7 @@ class SuspectHandling:
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:
         """Clear the anomaly; return the indices of the muscles that are isolated from now on.
 
-        A suspect that is being verified is restored, because a reset declares it healthy.
+        A suspect that is being verified is restored.
         """
         verified = self.verified
         self.finding = self.verification = None

@@ -142,7 +142,7 @@ class EstimatorNode(Shell):
             raise MusculoskeletalError(
                 '`isolate_muscles` names no muscle; set that parameter first'
             )
-        self.core.reset({*self.core.body.isolated, *self._muscles_to_isolate})
+        self.core.reset(isolating=self._muscles_to_isolate)
         self._publish_body()
         self._report()
         return self._isolated

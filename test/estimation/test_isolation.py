@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A suspect is isolated at once, and its response to winding in determines the verdict."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -195,15 +196,38 @@ def test_on_anomaly_stop_is_the_default_and_isolates_no_muscle(robot, calibrated
     assert loop.core.body.isolated == ()
 
 
-def test_a_reset_during_verification_restores_the_suspect(loop, healthy, cut):
+@pytest.mark.parametrize('service', ['reset', 'isolate'])
+def test_a_verification_is_ended_only_by_isolating_its_suspect(loop, healthy, cut, service):
     loop.step(healthy, 30)
     loop.step(cut, 20)
-    with pytest.raises(MusculoskeletalError, match='has no tension'):
-        loop.core.reset()
-    loop.step(healthy, 20)
-    loop.core.reset()
-    assert loop.core.body.isolated == ()
+    loop.step(healthy, 20)  # the muscle seems healthy, but it has not been wound in
+    with pytest.raises(MusculoskeletalError, match=f'verified.*within 10 s.*{service} again'):
+        loop.core.reset(isolating=[5] if service == 'isolate' else [])
+    assert loop.core.body.isolated == (2,)
+    assert loop.core.body.verified == 2
+    loop.core.reset(isolating=[2])
+    assert loop.core.body.isolated == (2,)
     assert loop.core.cause == ''
+
+
+def test_a_reset_during_its_verification_does_not_accept_a_length_that_has_jumped(
+    robot, calibrated, healthy
+):
+    quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
+    loop = Loop(robot, replace(calibrated, anomaly=quiet), healthy)
+    loop.step(healthy, 30)
+    loop.length = healthy.length + 0.05 * (np.arange(6) == 3)
+    jumped = healthy._replace(length=loop.length)
+    while loop.core.body.verified is None:
+        with suppress(RejectionError):
+            loop.step(jumped)
+    with pytest.raises(MusculoskeletalError, match='is being verified'):
+        loop.core.reset()
+    loop.step(jumped, 10)
+    loop.command = loop.command - 0.0015 * (np.arange(6) == 3)
+    loop.step(jumped, 100)
+    assert loop.core.suspects.last_verdict[1].outcome is Outcome.LENGTH_SENSOR_OFFSET
+    assert loop.core.body.isolated == (3,)
 
 
 def test_without_a_verification_the_report_names_the_remedy(loop, healthy, cut):

@@ -199,6 +199,29 @@ def test_a_muscle_without_its_commanded_length_or_tension_is_an_anomaly(
     assert estimator.estimator.core.cause.startswith(arm26.muscles[2])
 
 
+def test_isolating_another_muscle_does_not_end_a_verification(estimator, arm26, healthy):
+    assert estimator.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
+    healthy.data[6 + 2] = 0.0  # no tension in muscle 2
+    command = estimator.publisher(Float64MultiArray, 'muscle_tension_command')
+    bodies = estimator.bodies
+
+    def is_verified():
+        command.publish(array_message(np.full(6, 60.0), 'muscle'))
+        estimator.muscles.publish(healthy)
+        estimator.spin(0.02)
+        return bodies and bodies[-1].verified == 2
+
+    estimator.wait(is_verified, 'the verification')
+    suspect, other = arm26.muscles[2], arm26.muscles[4]
+    assert estimator.set_parameter('estimator', 'isolate_muscles', [other])[0]
+    answer = estimator.call(Trigger, 'estimator/isolate')
+    assert not answer.success
+    assert f'{suspect} is being verified' in answer.message
+    assert estimator.set_parameter('estimator', 'isolate_muscles', [suspect, other])[0]
+    answer = estimator.call(Trigger, 'estimator/isolate')
+    assert answer.message == f'isolated: {suspect}, {other}'
+
+
 def picture(robot, theta):
     pose = robot.kinematics.end_effector_pose(theta)
     message = PoseStamped()
