@@ -688,7 +688,8 @@ class Estimator:
             self._note(Evidence.MOVED, [finding.muscle])
             self.health.reset()  # evidence from before the repair is no longer valid
             return
-        isolated = self.suspects.take(finding, self.body.isolated, now)
+        has_network = self.mae is not None
+        isolated = self.suspects.take(finding, self.body.isolated, now, has_network)
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
         self._update_body()

@@ -15,7 +15,8 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
 
 With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
 `estimator/reset`. The same applies if two suspects were verified as healthy within the last 60 s,
-because there must be a fault that a verification does not reveal. Some kinds of findings have other
+because there must be a fault that a verification does not reveal, and before the first network,
+because a verification compares the suspect with the network. Some kinds of findings have other
 consequences:
 
     values_missing          is never latched. With `on_anomaly: isolate` the muscle is isolated
@@ -103,13 +104,16 @@ class SuspectHandling:
         muscle, verdict = self.last_verdict
         return f'{self._robot.muscles[muscle]}: {verdict}'
 
-    def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
+    def take(
+        self, finding: Finding, isolated: Iterable[int], now: float, has_network: bool = True
+    ) -> tuple[int, ...]:
         """Take a finding: latch it and isolate its muscle, as its kind and the settings require.
 
         Args:
             finding: The finding of a detector.
             isolated: Indices of the muscles isolated so far.
             now: Time on a steady clock [s].
+            has_network: Whether there is a network, without which no suspect can be verified.
 
         Returns:
             Indices of the muscles that are isolated from now on.
@@ -129,7 +133,7 @@ class SuspectHandling:
         self.finding = finding
         recent = [time for time in self._acquitted if now - time < WITHIN]
         may_isolate = self.isolates and finding.kind.reaction is FindingReaction.ISOLATE
-        if not may_isolate or len(recent) >= ACQUITTALS:
+        if not (may_isolate and has_network) or len(recent) >= ACQUITTALS:
             return isolated
         self.verification = self._verification_of(muscle)
         return (*isolated, muscle)

@@ -307,6 +307,21 @@ def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
     assert arm.offsets.revoked
 
 
+def test_without_a_network_a_jump_of_one_length_is_not_verified_but_revokes_its_offset(robot, mae):
+    arm = MovingArm(robot, mae)
+    arm.core = Estimator(robot)
+    arm.core.suspects.isolates = True
+    arm.go(1.0)
+    arm.off = ONE
+    arm.go(2.0)
+    assert arm.core.body.anomaly is Anomaly.FOUND
+    assert arm.core.body.isolated == ()
+    assert arm.offsets.revoked == (2,)
+    arm.core.use(mae)
+    arm.core.calibrate_lengths()
+    assert arm.kind is None
+
+
 def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
     arm = MovingArm(robot, mae)
     arm.core.calibrate_lengths()
