@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
+from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exact_mae import ExactMae
 
 from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, IN_A_ROW
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SLACK_LENGTH
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -198,3 +202,41 @@ def test_a_module_that_does_not_follow_its_command_is_found(robot, mae, watch, w
     assert findings
     assert {muscle for _, muscle in findings} == {3}
     assert 95 <= findings[0][0] <= 110
+
+
+class KnowingMae(ExactMae):
+    """A network that estimates the true posture θ without some muscles as well as with them."""
+
+    theta, isolated, is_calibrated = np.zeros(2), (), True
+
+    def without(self, isolated):
+        reduced = copy(self)
+        reduced.isolated = tuple(isolated)
+        return reduced
+
+    def estimate(self, *_):
+        return SimpleNamespace(theta=KnowingMae.theta)
+
+
+def test_a_frozen_sensor_is_found_beside_the_constant_reading_of_a_winch_that_stands(robot):
+    """Only the elbow moves, so the lengths of the two shoulder muscles stay the same."""
+    detector, frozen, found = FrozenSensor(robot), 3, []
+    detector.use(KnowingMae(robot))
+    tension = np.full(6, 60.0)
+    length = start = robot.muscle_lengths(0.5 * (robot.lower + robot.upper), tension)
+    for n in range(400):
+        elbow = 0.5 * np.sin(0.01 * n)
+        KnowingMae.theta = 0.5 * (robot.lower + robot.upper) + np.array([0.0, elbow])
+        before, length = length, robot.muscle_lengths(KnowingMae.theta, tension)
+        length[[0, 1]] = start[[0, 1]]
+        if n >= 50:
+            length[frozen] = before[frozen]
+        sample = SimpleNamespace(
+            length=length,
+            length_read=length,
+            motor_tension=tension + 0.01 * (n % 7),
+            bone_tension=tension,
+            usable=np.ones(6, dtype=bool),
+        )
+        found.append(detector.step(SimpleNamespace(sample=sample, dt=0.01, lengths_known=True)))
+    assert {each.muscle for each in found if each is not None} == {frozen}

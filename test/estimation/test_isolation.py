@@ -291,23 +291,6 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calib
     assert core.cause == f'{robot.muscles[frozen]}: its length {stays}'
 
 
-def test_a_frozen_sensor_is_detected_beside_a_muscle_that_stands_still(robot, calibrated, healthy):
-    """The elbow moves; the winch of a shoulder muscle stands, and its encoder has no noise."""
-    rng, frozen, standing = np.random.default_rng(0), 3, 0
-    core = Estimator(robot)
-    core.use(replace(calibrated, anomaly=replace(calibrated.anomaly, thresholds={'distance': 1e6})))
-    for n in range(600):
-        theta = 0.5 * (robot.lower + robot.upper) + [0.0, 0.5 * np.sin(0.01 * n)]
-        tension = healthy.tension + rng.standard_normal(6)
-        length = robot.muscle_lengths(theta, tension) + 1e-4 * rng.standard_normal(6)
-        length[standing] = healthy.length[standing]
-        if n >= 50:
-            length[frozen] = healthy.length[frozen]
-        core.take(reading([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
-    stays = 'length reading stays exactly the same while the arm moves'
-    assert core.cause == f'{robot.muscles[frozen]}: its {stays}'
-
-
 def test_a_tension_reading_that_freezes_at_the_bias_is_detected_if_it_had_noise_before(
     robot, calibrated, healthy
 ):
