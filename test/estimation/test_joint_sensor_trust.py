@@ -74,6 +74,23 @@ def test_a_sensor_that_slips_is_doubted_until_it_agrees_again(arm, size):
     assert arm.doubted == ()
 
 
+def test_a_sensor_that_is_repaired_late_is_trusted_again_however_long_the_arm_moved(arm):
+    for wrong in (arm.time, 400.0):  # as long as the arm had moved before, and much longer
+        arm.go(wrong, slip(0.5))
+        assert arm.doubted == (1,)
+        arm.go(30.0, systematic)
+        assert arm.doubted == ()
+
+
+def test_a_sensor_that_is_repaired_while_the_lengths_are_calibrated_is_trusted_again(arm):
+    arm.go(30.0, slip(0.5))
+    arm.check.forget()
+    arm.go(30.0, slip(0.5))
+    assert arm.doubted == (1,)
+    arm.go(30.0, systematic)
+    assert arm.doubted == ()
+
+
 @pytest.mark.parametrize('rate', [0.005, 0.01])
 def test_a_sensor_that_drifts_is_doubted(arm, rate):
     arm.go(40.0, lambda theta, t: systematic(theta) + np.array([rate * t, 0.0]))

@@ -21,6 +21,10 @@ from these messages fits them better than it will fit later ones, above all at t
 messages of different postures count, because the error of a network in one posture says little
 about others. Messages of an arm that carries a load do not count.
 
+A doubted sensor is compared with its own readings before the doubt. Their usual deviation and
+spread are kept until the doubt ends, even if these readings are forgotten meanwhile. When another
+network is used, kept deviations change by as much as its estimates of the earlier messages.
+
 A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
 the sensors of the joints with large x are false, or the length of a single muscle has changed.
 
@@ -126,10 +130,13 @@ class JointSensorTrust(Detector):
         self._counted_at = np.full(robot.joint_count, np.inf)
         self._usual: _Usual | None = None  # None if it has to be computed
         self._uses = 0  # number of messages judged by `_usual`
+        #: usual deviation θ − θ̂ and its spread [rad], (2, D), of joints whose earlier messages do
+        #: not show them because of a doubt; NaN for all other joints
+        self._kept = np.full((2, robot.joint_count), np.nan)
 
     def use(self, mae: Mae) -> None:
         """Use another network from now on, and ignore the muscles that it isolates."""
-        self._mae, self._usual = mae, None
+        previous, self._mae, self._usual = self._mae, mae, None
         self._compared.clear()
         if not self._messages:
             return
@@ -142,6 +149,12 @@ class JointSensorTrust(Detector):
         deviation = np.where(is_complete[:, None], theta - estimate, np.nan)
         residual = np.where(is_complete[:, None] & used, length, np.nan)
         self._compared.extend(zip(deviation, residual - mae.lengths(estimate, tension)))
+        if previous is not None and np.isfinite(self._kept[0]).any():
+            used |= ~np.isin(np.arange(length.shape[1]), previous.isolated)
+            rows = np.isfinite(length[:, used]).all(axis=1)
+            if rows.any():
+                before = previous.estimate(tension[rows], np.nan_to_num(length[rows])).theta
+                self._kept[0] += np.median(before - estimate[rows], axis=0)
 
     def drop_newest(self) -> None:
         """Drop the newest messages, because an anomaly has been found."""
@@ -150,8 +163,12 @@ class JointSensorTrust(Detector):
             self._compared.pop()
 
     def forget(self) -> None:
-        """Forget all messages, because the length offsets have changed; the trust stays."""
+        """Forget all messages, because the length offsets have changed.
+
+        The trust stays, and so do the usual deviations of doubted sensors, which end the doubt.
+        """
         self._usual = None
+        self._kept[:, ~self.trust.is_doubted] = np.nan
         self._messages.clear()
         self._compared.clear()
 
@@ -202,7 +219,8 @@ class JointSensorTrust(Detector):
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
         # Look for readings that are far from the estimate even while the arm stands still.
-        usual = 0.0 if self._usual is None else self._usual.deviation
+        kept = np.nan_to_num(self._kept[0])
+        usual = kept if self._usual is None else self._usual.deviation
         is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
             return
@@ -260,19 +278,16 @@ class JointSensorTrust(Detector):
             np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
             for part, values in enumerate(self._compared[0])
         )
-        count = np.isfinite(deviation).sum(axis=0)
-        is_known = count >= ENOUGH
-        middle = np.where(is_known, _median(deviation), 0.0)
-        newest = deviation[-ENOUGH:]  # the newest of the earlier messages
-        messages = islice(self._messages, len(earlier) - len(newest), len(earlier))
-        arrived = np.array([message.deviation for message in messages]).reshape(newest.shape)
-        arrived = np.where(np.isnan(newest), np.nan, arrived)
-        spread = TO_SIGMA * _median(np.abs(arrived - _median(arrived)))
+        messages = islice(self._messages, len(earlier))
+        arrived = np.array([message.deviation for message in messages]).reshape(deviation.shape)
+        shown = _usual_deviations(deviation, arrived)
+        is_shown = np.isfinite(shown[0])
+        usual = np.where(is_shown, shown, self._kept)
+        self._kept = np.where(is_shown & ~self.trust.is_doubted, np.nan, usual)
         usual_residual = _median(residual)
         residual_spread = TO_SIGMA * _median(np.abs(residual - usual_residual))
-        spread = np.where(is_known, spread, np.nan)
         residual_spread = np.fmax(residual_spread, LEAST_SPREAD)
-        return _Usual(middle, spread, usual_residual, residual_spread)
+        return _Usual(np.nan_to_num(usual[0]), usual[1], usual_residual, residual_spread)
 
     def _is_precise(self) -> bool:
         """Return whether estimates are precise enough to judge errors smaller than GROSS.
@@ -353,6 +368,9 @@ class JointSensorTrust(Detector):
         trusts = tuple(trust if is_it else each for is_it, each in zip(joints, old.trust))
         since, deviation = old.since.copy(), old.deviation.copy()
         if excess is not None:
+            assert self._usual is not None
+            usual = np.array([self._usual.deviation, self._usual.deviation_spread])
+            self._kept = np.where(joints, usual, self._kept)
             for j in np.flatnonzero(joints).tolist():
                 since[j] = self._begin_of_doubt(j)
                 deviation[j] = np.nanmedian(excess[-(WINDOWS[0][0] // 2) :, j])
@@ -365,7 +383,11 @@ class JointSensorTrust(Detector):
         """
         count = WINDOWS[0][0]
         deviation = np.array([deviation[joint] for deviation, _ in self._compared])
-        usual = np.nanmedian(deviation[:-NEWEST]) if len(deviation) > NEWEST else 0.0
+        earlier = deviation[:-NEWEST]
+        # The earlier messages have no readings of a sensor that a user has confirmed.
+        usual = np.nan_to_num(self._kept[0, joint])
+        if np.isfinite(earlier).any():
+            usual = np.nanmedian(earlier)
         excess = np.abs(deviation - usual)
         for end in range(len(excess) - 1, count, -1):
             if np.median(excess[end - count : end]) < AGREEING_LIMIT:  # NaN never agrees
@@ -385,6 +407,25 @@ def _unexplained(change: Array, jacobian: Array) -> float:
         motion = np.einsum('nkm,nm->nk', np.linalg.pinv(jacobian), change)
         change = change - np.einsum('nmk,nk->nm', jacobian, motion)
     return float(np.median(np.square(change).sum(axis=1)))
+
+
+def _usual_deviations(deviation: Array, arrived: Array) -> Array:
+    """Return the usual deviation and its spread of each joint, (2, D), from N earlier messages.
+
+    Both are NaN for a joint of which fewer than ENOUGH of these messages have a reading.
+
+    Args:
+        deviation: θ − θ̂ with the network in use [rad], (N, D); NaN where there is no reading.
+        arrived: θ − θ̂ with the network that was in use when each message arrived [rad], (N, D).
+    """
+    usual = np.full((2, deviation.shape[1]), np.nan)
+    for j, (values, then) in enumerate(zip(deviation.T, arrived.T, strict=True)):
+        known = np.isfinite(values)
+        if np.count_nonzero(known) >= ENOUGH:
+            newest = then[known][-ENOUGH:]
+            spread = TO_SIGMA * np.median(np.abs(newest - np.median(newest)))
+            usual[:, j] = np.median(values[known]), spread
+    return usual
 
 
 def _median(values: Array) -> Array:
