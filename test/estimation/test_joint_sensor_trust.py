@@ -129,3 +129,38 @@ def test_a_sensor_that_the_user_confirms_is_trusted_with_its_new_readings(arm):
     assert arm.check.trust.trust[1] is SensorTrust.CONFIRMED
     arm.go(60.0, slip(0.3))
     assert arm.doubted == ()
+
+
+class TurnedMae:
+    """A network whose second joint angle has another zero, as if it had learned another body."""
+
+    def __init__(self, mae, turn):
+        self._mae, self._turn = mae, np.array([0.0, turn])
+
+    def __getattr__(self, name):
+        return getattr(self._mae, name)
+
+    def estimate(self, tension, length):
+        estimate = self._mae.estimate(tension, length)
+        return estimate._replace(theta=estimate.theta - self._turn)
+
+    def lengths(self, theta, tension):
+        return self._mae.lengths(theta + self._turn, tension)
+
+    def muscle_jacobian(self, theta, tension):
+        return self._mae.muscle_jacobian(theta + self._turn, tension)
+
+
+def test_a_right_sensor_that_was_confirmed_is_not_doubted_while_the_network_learns_from_it(
+    robot, mae
+):
+    arm = Arm(robot, TurnedMae(mae, 1.0))
+    arm.go(10.0)
+    assert arm.doubted == (1,)
+    assert arm.check.confirm() == (1,)
+    arm.go(20.0)
+    assert arm.doubted == ()
+    arm.mae = mae  # the network has learned
+    arm.check.use(mae)
+    arm.go(100.0)
+    assert arm.doubted == ()

@@ -22,8 +22,9 @@ messages of different postures count, because the error of a network in one post
 about others. Messages of an arm that carries a load do not count.
 
 A doubted sensor is compared with its own readings before the doubt. Their usual deviation and
-spread are kept until the doubt ends, even if these readings are forgotten meanwhile. When another
-network is used, kept deviations change by as much as its estimates of the earlier messages.
+spread are kept until the doubt ends, even if these readings are forgotten meanwhile. If a user
+confirms the sensor, its newest deviations become the usual ones. When another network is used, kept
+deviations change by as much as its estimates of the earlier messages.
 
 A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
 the sensors of the joints with large x are false, or the length of a single muscle has changed.
@@ -175,7 +176,8 @@ class JointSensorTrust(Detector):
     def confirm(self) -> tuple[int, ...]:
         """Confirm all doubted sensors, because a user says that they are right.
 
-        Earlier readings of these sensors, which contradict the present ones, are discarded.
+        Earlier readings of these sensors, which contradict the present ones, are discarded. From
+        now on, the deviations since the beginning of the doubt count as usual.
 
         Returns:
             Indices of the joints whose sensors were in doubt.
@@ -184,10 +186,22 @@ class JointSensorTrust(Detector):
         if not joints:
             return ()
         self._usual = None
+        for j in joints:
+            self._kept[:, j] = self._newest_deviation(j), np.nan
         self._set(doubted, SensorTrust.CONFIRMED)
         for message, (deviation, _) in zip(self._messages, self._compared, strict=True):
             message.theta[doubted] = deviation[doubted] = np.nan
         return joints
+
+    def _newest_deviation(self, joint: int) -> float:
+        """Return the median of a joint's newest deviations since its doubt began [rad], or NaN."""
+        since = self.trust.since[joint]
+        deviation = [
+            compared[joint]
+            for message, (compared, _) in zip(self._messages, self._compared, strict=True)
+            if message.time >= since and np.isfinite(compared[joint])
+        ]
+        return float(np.median(deviation[-AGREEING:])) if deviation else np.nan
 
     def use_impossible(self, since: Mapping[int, float]) -> None:
         """Use no sensors that report impossible readings again and again.
