@@ -312,6 +312,12 @@ class Estimator:
         """The trust in each joint sensor, with times on the steady clock."""
         return self.health.joint_sensors.trust
 
+    @property
+    def body_after_restart(self) -> BodyState:
+        """The body state that a restarted estimator has to begin with."""
+        offsets = self.trust.after_restart
+        return self.body if offsets is self.body.offsets else self.body.with_offsets(offsets)
+
     def confirm_joint_sensors(self) -> tuple[int, ...]:
         """Confirm that the joint sensors are right, because a user says so.
 

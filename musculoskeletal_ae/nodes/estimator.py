@@ -47,6 +47,7 @@ from musculoskeletal_ae.ros.message_building import (
     serve,
 )
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
+from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 
@@ -63,6 +64,7 @@ class EstimatorNode(Shell):
         # The time distinguishes the body states of this estimator from those of an earlier one.
         generation = max(time.time_ns() // 1_000_000, 0 if found is None else found.generation + 1)
         self.core = Estimator(self.robot, self.parameter('preset'), generation)
+        self.remembered: BodyState | None = None  # what was last saved
         self.candidates = Candidates(self, self.core.networks)
         self.core.networks.accepted = self._accepted
         self._advertise()
@@ -241,8 +243,7 @@ class EstimatorNode(Shell):
     def _publish_body(self) -> None:
         """Publish the body state if it has changed, and act on the change."""
         body, before, suspects = self.core.body, self.body, self.core.suspects
-        if body is not before or self.memory.problem:  # repeat an attempt to save that has failed
-            self.memory.note(body)
+        self._remember()
         if body is before:
             return
         self.body = body
@@ -256,6 +257,14 @@ class EstimatorNode(Shell):
             self.candidates.give_up()
         if body.has_anomaly != before.has_anomaly:
             self._report()  # at once, because the report names the suspect
+
+    def _remember(self) -> None:
+        """Save what a restarted estimator has to know, if it has changed."""
+        remembered = self.core.body_after_restart
+        # Repeat an attempt to save that has failed.
+        if remembered != self.remembered or self.memory.problem:
+            self.remembered = remembered
+            self.memory.note(remembered)
 
     def conditions(self) -> Iterable[Condition]:
         """Yield the conditions of the core, and one if the body state could not be saved."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A restarted estimator knows which offsets were calibrated or revoked, and who was isolated."""
+"""A restarted estimator knows which lengths, muscles and joint sensors it must not rely on."""
 
 import time
 from dataclasses import replace
@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from musculoskeletal_ae.estimation.body_memory import FILE, BodyMemory
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 
 MUSCLES = ['biceps', 'triceps']
@@ -66,6 +67,15 @@ def test_provisional_offsets_of_a_calibration_are_not_saved_but_isolated_muscles
     assert_array_equal(found.offsets.offset, np.zeros(2))
     assert not found.offsets.known
     assert found.isolated == (0, 1)
+
+
+def test_a_length_that_changed_in_a_repair_is_unknown_after_a_restart_until_it_is_checked(tmp_path):
+    memory, trust = BodyMemory(tmp_path, MUSCLES), LengthTrust(2)
+    for evidence, is_known in ((Evidence.MOVED, False), (Evidence.CHECKED, True)):
+        trust.take(evidence, [1])
+        assert trust.offsets.known
+        memory.note(BodyState(trust.after_restart, generation=1))
+        assert BodyMemory(tmp_path, MUSCLES).found.offsets.known == is_known
 
 
 def test_a_file_of_an_earlier_version_names_no_isolated_muscles(tmp_path):

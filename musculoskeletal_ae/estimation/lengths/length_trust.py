@@ -11,12 +11,14 @@ on `body_state`, and all other nodes follow it.
     any ──── CALIBRATING ───────────────► UNKNOWN, for the muscles that are calibrated
     KNOWN ── MOVED, then CHECKED ───────► KNOWN, but the next calibration determines it anew
 
-The estimator itself knows that it has restarted, because it saves its offsets (`body_memory`).
+The estimator itself knows that it has restarted, because it saves its offsets (`body_memory`). A
+length that has MOVED and was not CHECKED is unknown after a restart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -103,6 +105,20 @@ class LengthTrust:
         is_moved = np.array([evidence in REPAIRED for evidence in self.evidence])
         is_precise = self.offsets.deviation < PRECISE
         return (self.offsets.trust == Trust.KNOWN) & is_precise & ~is_moved
+
+    @property
+    def after_restart(self) -> LengthOffsets:
+        """The offsets as a restarted estimator has to take them.
+
+        It does not know that a length changed in a repair (MOVED) and has to be checked before the
+        anomaly ends. The offset of such a muscle is therefore not known to it.
+        """
+        moved = [m for m, evidence in enumerate(self.evidence) if evidence is Evidence.MOVED]
+        if not moved:
+            return self.offsets
+        trust = self.offsets.trust.copy()
+        trust[moved] = Trust.UNKNOWN
+        return replace(self.offsets, trust=trust)
 
     @property
     def doubts(self) -> dict[str, tuple[int, ...]]:
