@@ -667,8 +667,8 @@ class ConditionKind(Enum):
         'state_not_saved',
         'estimator, controller, learner',
         'warn',
-        'what a restarted node should know cannot be saved: the length offsets and isolated '
-        'muscles, the stop, or the samples and the network (error)',
+        'what a restarted node should know cannot be saved: the length offsets, isolated muscles '
+        'and joint sensors in doubt, the stop, or the samples and the network (error)',
         'the newest state is not on disk',
         (Step.FREE_DISK,),
     )

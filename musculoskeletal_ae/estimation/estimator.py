@@ -16,7 +16,7 @@ describes the sequence from a rupture to resuming.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, NoReturn
 
@@ -27,6 +27,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import estimator_status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
+from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import SensorDoubt
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.estimation.finding import Finding, Observation, jump_finding
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
@@ -317,6 +318,21 @@ class Estimator:
         """The body state that a restarted estimator has to begin with."""
         offsets = self.trust.after_restart
         return self.body if offsets is self.body.offsets else self.body.with_offsets(offsets)
+
+    @property
+    def joint_doubts(self) -> dict[int, SensorDoubt]:
+        """The joint sensors in doubt, with what a restarted estimator has to know of them."""
+        return self.health.joint_sensors.doubts
+
+    def doubt_joint_sensors(self, doubts: Mapping[int, SensorDoubt], now: float) -> None:
+        """Begin with joint sensors in doubt, because the estimator before a restart doubted them.
+
+        Args:
+            doubts: The doubts, by index of the joint.
+            now: Time on the steady clock [s].
+        """
+        self.health.joint_sensors.begin_in_doubt(doubts, now)
+        self._follow_joint_trust()
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
         """Confirm that the joint sensors are right, because a user says so.

@@ -59,12 +59,14 @@ class EstimatorNode(Shell):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
-        self.memory = BodyMemory(self.state_directory(), self.robot.muscles)
+        self.memory = BodyMemory(self.state_directory(), self.robot.muscles, self.robot.joints)
         found = self.memory.found
         # The time distinguishes the body states of this estimator from those of an earlier one.
         generation = max(time.time_ns() // 1_000_000, 0 if found is None else found.generation + 1)
         self.core = Estimator(self.robot, self.parameter('preset'), generation)
-        self.remembered: BodyState | None = None  # what was last saved
+        self.core.doubt_joint_sensors(self.memory.doubts, time.monotonic())
+        #: what was last saved: the body state, and the joints whose sensors are in doubt
+        self.remembered: tuple[BodyState, tuple[int, ...]] | None = None
         self.candidates = Candidates(self, self.core.networks)
         self.core.networks.accepted = self._accepted
         self._advertise()
@@ -260,11 +262,11 @@ class EstimatorNode(Shell):
 
     def _remember(self) -> None:
         """Save what a restarted estimator has to know, if it has changed."""
-        remembered = self.core.body_after_restart
+        remembered = self.core.body_after_restart, self.core.joint_trust.doubted
         # Repeat an attempt to save that has failed.
         if remembered != self.remembered or self.memory.problem:
             self.remembered = remembered
-            self.memory.note(remembered)
+            self.memory.note(remembered[0], self.core.joint_doubts)
 
     def conditions(self) -> Iterable[Condition]:
         """Yield the conditions of the core, and one if the body state could not be saved."""
@@ -277,6 +279,7 @@ class EstimatorNode(Shell):
         if trust is before:
             return
         self.published_trust = trust
+        self._remember()
         rows = trust.rows(time.monotonic())
         rows[-1] = self.robot.units.to_position(trust.deviation)
         self.trust.publish(array_message(rows, 'quantity', 'joint'))

@@ -9,10 +9,11 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from musculoskeletal_ae.estimation.body_memory import FILE, BodyMemory
+from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import SensorDoubt
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 
-MUSCLES = ['biceps', 'triceps']
+MUSCLES, JOINTS = ['biceps', 'triceps'], ['shoulder', 'elbow']
 OFFSETS = LengthOffsets(np.array([0.05, -0.08]), np.full(2, 1e-3))
 FOUND = BodyState(OFFSETS, (1,), generation=12)
 HEALTHY = BodyState.healthy(2)
@@ -67,6 +68,20 @@ def test_provisional_offsets_of_a_calibration_are_not_saved_but_isolated_muscles
     assert_array_equal(found.offsets.offset, np.zeros(2))
     assert not found.offsets.known
     assert found.isolated == (0, 1)
+
+
+def test_the_next_estimator_finds_joint_sensors_in_doubt_by_their_names_until_the_doubt_ends(
+    tmp_path,
+):
+    memory = BodyMemory(tmp_path, MUSCLES, JOINTS)
+    doubts = {1: SensorDoubt(0.5, -0.04, 0.01), 0: SensorDoubt(0.9, 0.0, np.nan)}
+    memory.note(HEALTHY, doubts)
+    found = BodyMemory(tmp_path, MUSCLES, ['elbow', 'wrist', 'shoulder'])
+    assert found.found.offsets.known
+    assert found.doubts[0] == doubts[1]
+    np.testing.assert_array_equal(found.doubts[2], doubts[0])
+    memory.note(HEALTHY, {})
+    assert BodyMemory(tmp_path, MUSCLES, JOINTS).doubts == {}
 
 
 def test_a_length_that_changed_in_a_repair_is_unknown_after_a_restart_until_it_is_checked(tmp_path):

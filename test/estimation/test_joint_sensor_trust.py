@@ -91,6 +91,16 @@ def test_a_sensor_that_is_repaired_while_the_lengths_are_calibrated_is_trusted_a
     assert arm.doubted == ()
 
 
+def test_a_restarted_estimator_doubts_a_slipped_sensor_until_it_is_repaired(arm):
+    arm.go(30.0, slip(0.5))
+    restarted = Arm(arm.robot, arm.mae)
+    restarted.check.begin_in_doubt(arm.check.doubts, 0.0)
+    restarted.go(100.0, slip(0.5))
+    assert restarted.doubted == (1,)
+    restarted.go(30.0, systematic)
+    assert restarted.doubted == ()
+
+
 @pytest.mark.parametrize('rate', [0.005, 0.01])
 def test_a_sensor_that_drifts_is_doubted(arm, rate):
     arm.go(40.0, lambda theta, t: systematic(theta) + np.array([rate * t, 0.0]))

@@ -14,12 +14,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import SensorDoubt
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.message_building import array_message
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message
+from musculoskeletal_ae.signals.joint_trust_message import SensorTrust
 
 
 @pytest.fixture
@@ -220,6 +223,26 @@ def test_isolating_another_muscle_does_not_end_a_verification(estimator, arm26, 
     assert estimator.set_parameter('estimator', 'isolate_muscles', [suspect, other])[0]
     answer = estimator.call(Trigger, 'estimator/isolate')
     assert answer.message == f'isolated: {suspect}, {other}'
+
+
+def test_a_restarted_estimator_relies_on_no_doubted_sensor_and_no_length_that_moved_in_a_repair(
+    estimator, trained_file, healthy
+):
+    trusts = estimator.listen(Float64MultiArray, 'joint_sensor_trust', LATCHED)
+    answer(estimator, healthy)
+    core = estimator.estimator.core
+    core.doubt_joint_sensors({1: SensorDoubt(0.5, 0.02, 0.01)}, time.monotonic())
+    answer(estimator, healthy)
+    core.trust.take(Evidence.MOVED, [2])
+    answer(estimator, healthy)
+    assert estimator.bodies[-1].offsets.known
+    estimator.end(estimator.estimator)
+    trusts.clear()
+    before = estimator.bodies[-1].generation
+    estimator.host(EstimatorNode, robot='arm26', checkpoint=trained_file)
+    estimator.wait(lambda: trusts and estimator.bodies[-1].generation > before, 'the new estimator')
+    assert trusts[0].data[:2].tolist() == [SensorTrust.TRUSTED, SensorTrust.DOUBTED]
+    estimator.wait(lambda: not estimator.bodies[-1].offsets.known, 'the unknown offsets')
 
 
 def picture(robot, theta):

@@ -110,6 +110,14 @@ class _Usual(NamedTuple):
     residual_spread: Array  # spread of these length errors [m], (M,)
 
 
+class SensorDoubt(NamedTuple):
+    """A joint sensor in doubt, with the values by which it can be trusted again."""
+
+    deviation: float  # by how much it differed from the lengths when the doubt began [rad]
+    usual: float  # its usual deviation θ − θ̂ before the doubt [rad]
+    spread: float  # healthy spread of this deviation [rad]; NaN if unknown
+
+
 class JointSensorTrust(Detector):
     """Decides which joint sensors of one arm are trusted, by comparing them with muscle lengths.
 
@@ -202,6 +210,28 @@ class JointSensorTrust(Detector):
             if message.time >= since and np.isfinite(compared[joint])
         ]
         return float(np.median(deviation[-AGREEING:])) if deviation else np.nan
+
+    @property
+    def doubts(self) -> dict[int, SensorDoubt]:
+        """The sensors in doubt, by index of the joint."""
+        usual, spread = self._kept.tolist()
+        deviation = self.trust.deviation.tolist()
+        return {j: SensorDoubt(deviation[j], usual[j], spread[j]) for j in self.trust.doubted}
+
+    def begin_in_doubt(self, doubts: Mapping[int, SensorDoubt], now: float) -> None:
+        """Begin with sensors in doubt, because an earlier estimator has doubted them.
+
+        Args:
+            doubts: Their doubts, by index of the joint.
+            now: Time on the steady clock [s].
+        """
+        trust, since, deviation = list(self.trust.trust), self.trust.since, self.trust.deviation
+        since, deviation = since.copy(), deviation.copy()
+        for j, doubt in doubts.items():
+            trust[j], since[j], deviation[j] = SensorTrust.DOUBTED, now, doubt.deviation
+            self._kept[:, j] = doubt.usual, doubt.spread
+        if doubts:
+            self.trust, self._usual = JointTrust(tuple(trust), since, deviation), None
 
     def use_impossible(self, since: Mapping[int, float]) -> None:
         """Use no sensors that report impossible readings again and again.
