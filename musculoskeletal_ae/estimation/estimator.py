@@ -464,8 +464,11 @@ class Estimator:
         return estimator_status.conditions(self, now)
 
     def rejected_because(self, now: float) -> str:
-        """Return why all muscle states have been rejected for longer than 0.1 s; '' otherwise."""
-        return self._rejected.lasting(now)
+        """Return why all muscle states have been rejected for longer than 0.1 s; '' otherwise.
+
+        Nothing is rejected once no message has arrived for 1 s (SILENCE).
+        """
+        return self._rejected.lasting(now) if now - self.received_at <= SILENCE else ''
 
     def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
         self._rejected.note('', now)

@@ -18,7 +18,7 @@ from musculoskeletal_ae.estimation.finding import Detector
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.residuals import TouchStatistics
-from musculoskeletal_ae.messages.arrival import INTERRUPTION
+from musculoskeletal_ae.messages.arrival import INTERRUPTION, SILENCE
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.reading_limits import LIMITS
 
@@ -257,7 +257,7 @@ def test_several_muscles_without_numbers_isolate_none_because_their_sensors_may_
     assert core.body.isolated == ()
 
 
-def test_rejected_muscle_states_are_reported_until_the_first_that_is_used(stepped, healthy):
+def test_rejected_muscle_states_are_reported_as_long_as_they_arrive(stepped, healthy):
     def reported():
         conditions = stepped.core.conditions(stepped.now)
         return 'readings_rejected' in [each.identifier for each in conditions]
@@ -267,6 +267,13 @@ def test_rejected_muscle_states_are_reported_until_the_first_that_is_used(steppe
     for _ in range(round(2.0 * LIMITS.glitch / DT)):
         with pytest.raises(RejectionError):
             stepped.step(broken)
+    assert reported()
+    stepped.now += 0.5 * SILENCE
+    assert reported()
+    stepped.now += SILENCE  # the driver has ended
+    assert not reported()
+    with pytest.raises(RejectionError):
+        stepped.step(broken)
     assert reported()
     stepped.step(healthy)
     assert not reported()
