@@ -4,7 +4,8 @@
 A rest sample is the mean of θ, T and l over the messages of a rest: a time in which the arm does
 not move (`rest`), the length offsets are known, and no anomaly is detected shortly before or after
 (`anomaly_margin`). Only new samples are kept (`collector`). A sample is new when θ or T differs
-from every stored one by more than a threshold (paper, §III-C). When the store is full, it drops the
+from every stored one by more than a threshold (paper, §III-C). Two samples of which one lacks an
+angle are compared by l as well (`SampleStore.is_new`). When the store is full, it drops the
 older of the two samples that are nearest to each other. The remaining samples then cover all
 postures and tensions so far, and the newest sample always stays.
 
@@ -42,8 +43,8 @@ CAPACITY = 400  # keep at most this many samples by default, and drop the most s
 #: Estimate tendon creep once the number of accepted samples exceeds this share of the capacity, and
 #: this share of the samples has all joint angles.
 CREEP_SHARE = 0.5
-#: divide lengths by this typical moment arm to compare them with angles, where not all joint angles
-#: were measured [m]
+#: divide lengths by this typical moment arm to compare them with angles, where a sample lacks an
+#: angle [m]
 MOMENT_ARM = 0.04
 JOINT_DISTANCE = 0.05  # keep a sample if an angle differs from every stored one by more [rad]
 TENSION_DISTANCE = 10.0  # keep a sample if a tension differs from every stored one by more [N]
@@ -92,12 +93,16 @@ class SampleStore:
         return [each.sample for each in self.stored]
 
     def is_new(self, sample: Sample) -> bool:
-        """Return whether a sample is new: an angle or tension differs from every stored sample.
+        """Return whether a sample is new: it differs from every stored sample.
 
-        The thresholds are JOINT_DISTANCE and TENSION_DISTANCE.
+        Two samples differ if an angle or a tension does. The thresholds are JOINT_DISTANCE and
+        TENSION_DISTANCE. If one of the two lacks an angle, a length may differ instead. A sample
+        also differs from one that lacks an angle which it has itself.
         """
-        points = self._scaled([*self.samples, sample])
-        return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
+        points = _Points.of([*self.samples, sample])
+        differs = (np.abs(points.differences(-1)) > 1.0).any(axis=1)
+        adds_angle = (np.isnan(points.theta) & np.isfinite(points.theta[-1])).any(axis=1)
+        return bool((differs | adds_angle)[:-1].all())
 
     def add(
         self,
@@ -209,29 +214,58 @@ class SampleStore:
             age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
-    def _scaled(self, samples: Sequence[Sample]) -> Array:
-        """Return samples as points (N, D + 2 M) in units of the thresholds.
-
-        The coordinates are θ, T and l. Samples with all joint angles are compared without l, and
-        samples without some angle also by l. Coordinates that are unmeasured or not compared are
-        NaN.
-        """
-        theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
-        unread = np.isnan(theta).any(axis=1, keepdims=True)
-        # Where not all joint angles were measured, compare samples by muscle lengths as well.
-        by_length = np.where(unread, length / (MOMENT_ARM * JOINT_DISTANCE), np.nan)
-        by_angle, by_tension = theta / JOINT_DISTANCE, tension / TENSION_DISTANCE
-        return np.concatenate([by_angle, by_tension, by_length], axis=1)
-
     def _dispensable(self) -> int:
-        points = np.nan_to_num(self._scaled(self.samples))
-        square = np.sum(points**2, axis=1)
-        distance = square[:, None] + square - 2.0 * points @ points.T
+        """Return the index of the older one of the two most similar samples."""
+        distance = _Points.of(self.samples).squared_distances()
         distance[np.diag_indices_from(distance)] = np.inf
         # Prefer to drop samples that no longer describe all muscles.
         lost = 1.0 - np.array([each.known for each in self.stored]).mean(axis=1)
         distance /= 1.0 + lost[:, None] + lost
         return int(min(np.unravel_index(np.argmin(distance), distance.shape)))
+
+
+class _Points(NamedTuple):
+    """Samples as points, in units of the distances from which on two samples differ."""
+
+    theta: Array  # (N, D); NaN where it was not measured
+    tension: Array  # (N, M)
+    length: Array  # (N, M)
+
+    @classmethod
+    def of(cls, samples: Sequence[Sample]) -> _Points:
+        """Return the points of some samples."""
+        theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
+        unit = MOMENT_ARM * JOINT_DISTANCE
+        return cls(theta / JOINT_DISTANCE, tension / TENSION_DISTANCE, length / unit)
+
+    @property
+    def is_complete(self) -> Bools:
+        """Whether all angles of each sample were measured, (N,)."""
+        complete: Bools = np.isfinite(self.theta).all(axis=1)
+        return complete
+
+    def differences(self, place: int) -> Array:
+        """Return how θ, T and l of all samples differ from those of one, (N, D + 2 M).
+
+        They are NaN where they are not compared: angles that one of both samples lacks, and the
+        lengths of two samples that have all angles.
+        """
+        theta, tension, length = (part - part[place] for part in self)
+        complete = self.is_complete
+        length[complete & complete[place]] = np.nan
+        return np.concatenate([theta, tension, length], axis=1)
+
+    def squared_distances(self) -> Array:
+        """Return the squared distances between all samples, (N, N)."""
+        # Compare all samples that have all angles at once, because that is much faster.
+        parts = self.theta, self.tension, np.zeros_like(self.length)
+        points = np.nan_to_num(np.concatenate(parts, axis=1))
+        square = np.sum(points**2, axis=1)
+        distance: Array = square[:, None] + square - 2.0 * points @ points.T
+        for place in np.flatnonzero(~self.is_complete):
+            to_others = np.nansum(self.differences(int(place)) ** 2, axis=1)
+            distance[place] = distance[:, place] = to_others
+        return distance
 
 
 def _filled(parts: Sequence[Array], nothing: float) -> Array:
