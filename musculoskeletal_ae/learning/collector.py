@@ -12,7 +12,6 @@ muscles a sample describes.
 
 import math
 from collections import Counter
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -152,13 +151,7 @@ class SampleCollector:
 
     def _paired(self, time: float, sample: MuscleSample) -> Paired[MuscleSample] | None:
         if self.body.isolated:
-            used = sample.usable
-            sample = replace(
-                sample,
-                length=np.where(used, sample.length, 0.0),
-                tension_read=np.where(used, sample.tension_read, 0.0),
-                sliding=np.where(used, sample.sliding, 0.0),
-            )
+            sample = sample.without_isolated()
         return self._pairing.muscles(time, sample)
 
     def collect(self, paired: Paired[MuscleSample], now: float = math.nan) -> list[Sample]:

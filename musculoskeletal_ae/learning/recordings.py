@@ -185,7 +185,8 @@ def collect_rests(
         joints.reset()
         theta = joints.take(0.0, row)
         try:
-            sample = muscles.take(MuscleReadings(length=length, tension=tension), 0.0)
+            reading = MuscleReadings(length=length, tension=tension)
+            sample = muscles.take(reading, 0.0).without_isolated()
         except RejectionError as error:
             learner.collector.rejected[error.reason] += 1
             continue

@@ -119,6 +119,15 @@ class MuscleSample:
         newest = self.newest.replace(length=self.newest.length - offset)
         return replace(self, length=self.length - offset, newest=newest)
 
+    def without_isolated(self) -> MuscleSample:
+        """Return the same sample with 0 for what is learned of isolated muscles."""
+        return replace(
+            self,
+            length=np.where(self.usable, self.length, 0.0),
+            tension_read=np.where(self.usable, self.tension_read, 0.0),
+            sliding=np.where(self.usable, self.sliding, 0.0),
+        )
+
 
 class MuscleStream:
     """Turns the messages of one arm's muscle modules into samples.

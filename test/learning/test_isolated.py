@@ -6,6 +6,8 @@ import numpy as np
 from learning.conftest import job
 from learning.test_learner import IdleTrainer
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.recordings import collect
+from musculoskeletal_ae.tables.table import Table
 
 LOST = 2
 
@@ -50,6 +52,20 @@ def test_isolated_muscles_are_left_out_of_samples_and_of_the_next_update(
     again = Learner(arm26, trainer=IdleTrainer, directory=tmp_path)
     assert [each.known[LOST] for each in again.samples.stored] == [True] * 3 + [False]
     again.close()
+
+
+def test_a_table_of_rests_teaches_nothing_of_the_readings_of_an_isolated_muscle(
+    arm26, initial, stage
+):
+    theta, tension, length = stage.states(10)
+    learner = Learner(arm26, initial, trainer=IdleTrainer)
+    learner.use_body(learner.body.with_isolated((LOST,)))
+    collect(learner, Table.of(arm26, theta, length, tension))
+    samples = learner.samples.samples
+    assert len(samples) == 10
+    assert all(sample.tension[LOST] == sample.length[LOST] == 0.0 for sample in samples)
+    used = np.arange(6) != LOST
+    np.testing.assert_array_equal([sample.tension[used] for sample in samples], tension[:, used])
 
 
 def test_an_update_follows_when_muscles_are_isolated_or_restored(arm26, initial, stage):
