@@ -58,6 +58,7 @@ class Learner:
         scheduler: Decides when an update begins.
         trainer: Computes updates.
         keeper: Stores and publishes networks.
+        refused: Number of finished updates that were refused (`impossible_offsets`).
         enabled: Whether the learner learns, see `enable`.
     """
 
@@ -102,7 +103,7 @@ class Learner:
                 f'tension_source of muscles.yaml is none; legal: {SENSOR}, {MARKER}'
             )
         self.robot = robot
-        self.enabled = True
+        self.enabled, self.refused = True, 0
         self._steps = steps
         self._polled_at = math.inf  # time of the last poll [s]
         self.trainer = trainer(robot, preset, seed)
@@ -303,6 +304,7 @@ class Learner:
             return
         mae = self.scheduler.finish(update)
         if self.impossible_offsets:
+            self.refused += 1
             return
         for muscle, newest in update.changed:
             self._forget(muscle, newest)

@@ -110,7 +110,15 @@ def complete(learner: Learner, progress: Callable[[float], None] | None = None) 
 
 
 def unchanged(learner: Learner) -> str:
-    """Return why the learner's network is unchanged, as a text for users; '' if it has learned."""
+    """Return why the last update changed no network, as a text for users; '' if it changed one."""
+    if offsets := learner.impossible_offsets:
+        each = ', '.join(f'{joint} ({text})' for joint, text in offsets.items())
+        return (
+            f'{learner.refused} of {learner.updates} updates were refused, because they found '
+            f'offsets that no joint sensor has: {each}. State the positions of these joints with '
+            'the zero, the sign and the unit of robot.urdf, or correct robot.urdf; check the '
+            'lengths as well'
+        )
     if learner.last_update is not None:
         return learner.last_update.unchanged
     return (

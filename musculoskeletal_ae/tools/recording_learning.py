@@ -106,10 +106,11 @@ def train(args: Namespace) -> None:
     for reason, count in learner.collector.rejected.items():
         if at_rest:
             warnings.append(f'{count} rows were not learned: {reason}')
-    if not learner.updates or (learner.last_update and learner.last_update.unchanged):
+    if why := _nothing_learned(learner, at_rest):
         _warn(warnings)
-        why = _nothing_learned(learner, at_rest)
         raise MusculoskeletalError(f'{why}; {args.out} was not written')
+    if refused := unchanged(learner):
+        warnings.append(refused)
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(_learned(learner))
     zero = (
@@ -378,15 +379,20 @@ def _learned(learner: Learner) -> str:
 
 
 def _nothing_learned(learner: Learner, at_rest: bool) -> str:
-    """Return why no update took place, and what to record instead.
+    """Return why no update changed the network, and what to do; '' if one did.
 
     `at_rest` says whether the recording consists of resting postures only.
     """
+    why = unchanged(learner)
+    if not why or (learner.impossible_offsets and learner.updates > learner.refused):
+        return ''
+    why = f'nothing was learned ({learner.updates} updates): {why}'
+    if learner.impossible_offsets:
+        return why
     rest = '' if at_rest else f' and rests in each for at least {REST_TIME:g} s'
     return (
-        f'nothing was learned ({learner.updates} updates): {unchanged(learner)}. Record some '
-        f'minutes in which the healthy arm moves from posture to posture{rest}, as with '
-        'controller/explore'
+        f'{why}. Record some minutes in which the healthy arm moves from posture to posture{rest}, '
+        'as with controller/explore'
     )
 
 
@@ -407,7 +413,7 @@ def _keep(learner: Learner, args: Namespace) -> str:
 
     The file of `--out` does not change: it may have the network of an earlier, complete run.
     """
-    if args.checkpoint and not learner.updates:
+    if args.checkpoint and learner.updates == learner.refused:
         return f'nothing was learned yet, and {args.out} was not written'
     file = args.out.with_name(f'{args.out.stem}.interrupted{args.out.suffix}')
     with STOP.reacting(Reaction.REMEMBER):  # a second Ctrl-C must not lose the network

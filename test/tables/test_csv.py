@@ -2,6 +2,7 @@
 """Reading an arm's readings from CSV files and arrays, and `train --from-csv`."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning import convergence
+from musculoskeletal_ae.learning import convergence, learner
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.robot import Robot
@@ -258,6 +259,20 @@ def test_preset_paper_says_that_it_does_not_learn_from_20_postures(
     file = write(tmp_path / 'a.csv', headers(arm26), readings(arm26, 25))  # 20 are learned
     out = tmp_path / 'out.safetensors'
     options = ['--checkpoint', str(trained_files['paper']), '--out', str(out), '--preset', 'paper']
+def test_joint_positions_with_another_zero_are_named_and_nothing_is_written(
+    arm26, trained, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(learner, 'LARGEST_OFFSET', 0.1)  # reached after few updates
+    rows = readings(arm26, 60)
+    rows[:, 1] -= 0.5
+    assert trained(write(tmp_path / 'a.csv', headers(arm26), rows)) == 1
+    printed = capsys.readouterr().err
+    assert re.search(r'nothing was learned \(2 updates\): 2 of 2 updates were refused', printed)
+    assert re.search(r'elbow \(-0\.\d+ rad, largest 0\.10\)', printed)
+    assert 'shoulder (' not in printed
+    assert not trained.out.exists()
+
+
     assert main(['--robot', 'arm26', '--from-csv', str(file), *options]) == 1
     expected = '20 different resting postures, and preset paper learns from at least 21'
     assert expected in capsys.readouterr().err
