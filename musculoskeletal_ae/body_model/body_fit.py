@@ -8,6 +8,7 @@ model becomes the prior again.
 """
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
@@ -15,10 +16,13 @@ from musculoskeletal_ae.body_model.fit import fit_body, fit_to_network
 from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.postures import FittedBody
 from musculoskeletal_ae.body_model.remainder import Remainder
+from musculoskeletal_ae.body_model.sensor_offsets import LARGEST_OFFSET
 from musculoskeletal_ae.body_model.synthetic import held_tensions
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
+#: compare the body fitted to a network with at most this many of the newest samples
+NEWEST = 20
 #: measure by how much an update lengthens each muscle as the mean over this many random postures
 PROBES = 200
 #: report a muscle as changed if at least this many of its newest samples contradict the fitted
@@ -60,16 +64,25 @@ class BodyFit:
     def is_of_another_arm(self, observed: Observations) -> bool:
         """Return whether samples contradict the body that was fitted to the network.
 
-        The check runs once, as soon as there are enough samples. All other calls return False.
+        The check runs once, as soon as there are enough samples. All other calls return False. Only
+        the NEWEST samples count, because tendons creep. Length differences that offsets of the
+        joint sensors explain do not count either: learning accepts offsets up to LARGEST_OFFSET,
+        and a network does not contain them.
         """
-        observed = observed.with_all_angles()
-        if self._prior_mean is None or self._is_prior_confirmed or len(observed) < LEAST_NEWEST:
+        observed = observed.with_all_angles()[-NEWEST:]
+        if self._prior_mean is None or self._is_prior_confirmed:
+            return False
+        if len(observed) < LEAST_NEWEST or not observed.known.any():
             return False
         self._is_prior_confirmed = True
         body = CalibratedBody(self.body.robot, self._prior_mean)
         body.remainder = self.body.remainder.before or body.remainder
         (length,) = body.lengths(observed.theta, observed.tension, observed.direction)
-        return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
+        residual = (observed.length - length)[observed.known]
+        # An offset z of the sensors changes the lengths of a posture by −G z.
+        slope = -self.body.robot.routes.muscle_jacobian(observed.theta)[observed.known]
+        zero = lsq_linear(slope, residual, (-LARGEST_OFFSET, LARGEST_OFFSET)).x
+        return bool(np.median(np.abs(residual - slope @ zero)) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
         """Discard the fit, which was that of another arm; start from the geometric model."""

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION, synthetic_samples
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body_updater import BodyUpdater, learned_steps
 from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.training_process import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.network import from_mae
@@ -213,6 +215,18 @@ def test_a_network_of_another_arm_adapts_as_fast_as_an_initial_one(learned, arm2
         update = BodyUpdater(arm26, start).update(job(store))
         ends.append(error(update.mae, *states))
     assert ends[0] < 1.3 * ends[1]
+
+
+def test_sensor_offsets_and_creep_do_not_look_like_another_arm(learned, arm26):
+    mae, _, _, stage = learned
+    store, offset = SampleStore(), np.deg2rad([5.0, 5.0])
+    for _ in range(60):
+        sample, crept = stage.sample(), 0.01 * (len(store) < 40)  # tendons were shorter before
+        store.add(sample._replace(theta=sample.theta + offset, length=sample.length - crept))
+    assert not BodyFit(arm26, mae).is_of_another_arm(store.observations())
+    other = Stage(drawn_body(arm26, 8, 5, 1.0))
+    for count in (4, 60):
+        assert BodyFit(arm26, mae).is_of_another_arm(other.observations(count))
 
 
 def test_removing_tendon_friction_improves_the_estimate(learned):
