@@ -10,7 +10,7 @@ the characters _ . / : - make no difference. A user can name the columns and uni
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -106,7 +106,7 @@ def find_columns(
     for place, header in enumerate(headers):
         if header in taken:
             key = keys[taken[header]]
-            unit = _split(header)[1]
+            unit = _split(header)[1] or _suffix(header, _legal_units(robot, key.kind))[1]
         else:
             matched, unit = _match(header, by_name)
             if matched is None or matched in {keys[name] for name in chosen}:
@@ -167,21 +167,34 @@ def _match(header: str, names: Mapping[str, Key]) -> tuple[Key | None, str]:
     name, unit = _split(header)
     if (key := names.get(_plain(name))) is not None:
         return key, unit
-    stem, _, last = _plain(header).rpartition('_')
-    key = names.get(stem)
-    if key is not None:
-        for symbol in UNITS[key.kind]:
-            if symbol.lower() == last:
-                return key, symbol
+    for kind, legal in UNITS.items():
+        stem, unit = _suffix(header, legal)
+        key = names.get(stem)
+        if unit and key is not None and key.kind is kind:
+            return key, unit
     return None, ''
 
 
-def _scale(robot: Robot, key: Key, unit: str, header: str) -> float:
-    legal = {
+def _suffix(header: str, legal: Iterable[str]) -> tuple[str, str]:
+    """Return a header in the form of `_plain` without the unit at its end, and this unit or ''."""
+    stem, _, last = _plain(header).rpartition('_')
+    for symbol in legal:
+        if stem and symbol.lower() == last:
+            return stem, symbol
+    return _plain(header), ''
+
+
+def _legal_units(robot: Robot, kind: Kind) -> dict[str, float]:
+    """Return the units of a kind of quantity that a robot can have, with their sizes."""
+    return {
         symbol: size
-        for symbol, size in UNITS[key.kind].items()
+        for symbol, size in UNITS[kind].items()
         if symbol not in CURRENTS or robot.tension_source.is_current
     }
+
+
+def _scale(robot: Robot, key: Key, unit: str, header: str) -> float:
+    legal = _legal_units(robot, key.kind)
     currents = robot.tension_source.newton_per_ampere
     try:
         size = legal[unit] if unit in legal else float(unit or 1.0)

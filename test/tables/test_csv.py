@@ -98,6 +98,30 @@ def test_columns_are_chosen_by_header_or_by_number(arm26, tmp_path):
     chosen = {key: f'#{i}' for i, key in enumerate(keys, 1)}
     table, _ = read_csv(bare, arm26, columns=chosen)
     np.testing.assert_allclose(table.rows.tension, rows[:, 8:], atol=1e-6)
+    first, *others = bare.read_text().splitlines()
+    bare.write_text('\n'.join([',' + first.partition(',')[2], *others]))  # an angle is missing
+    table, _ = read_csv(bare, arm26, columns=chosen)
+    assert len(table) == len(rows) and np.isnan(table.rows.theta[0, 0])
+
+
+def test_units_at_the_end_of_the_headers_of_chosen_columns_are_used(arm26, tmp_path):
+    rows = readings(arm26)
+    scaled = rows * np.r_[np.full(2, 180.0 / np.pi), np.full(6, 1000.0), np.full(6, 0.001)]
+    lengths, loads = ([each.format(i) for i in range(6)] for each in ('enc{}_mm', 'load{}_kN'))
+    names = ['q1_deg', 'q2_deg', *lengths, *loads]
+    keys = headers(arm26, 'length:{}', 'tension:{}')
+    file = write(tmp_path / 'a.csv', ['elapsed_ms', *names], np.c_[np.arange(100), scaled])
+    columns = dict(zip(['time', *keys], ['elapsed_ms', *names], strict=True))
+    table, found = read_csv(file, arm26, columns)
+    np.testing.assert_allclose(table.rows.time, 0.001 * np.arange(100))
+    np.testing.assert_allclose(table.rows.theta, rows[:, :2], atol=1e-6)
+    np.testing.assert_allclose(table.rows.length, rows[:, 2:8], atol=1e-6)
+    np.testing.assert_allclose(table.rows.tension, rows[:, 8:], atol=1e-2)
+    assert {column.unit for column in found} == {'ms', 'deg', 'mm', 'kN'}
+    names = [name.replace('load', 'load_a').replace('_kN', '_a') for name in names]
+    file = write(tmp_path / 'a.csv', ['elapsed_ms', *names], np.c_[np.arange(100), scaled])
+    columns = dict(zip(['time', *keys], ['elapsed_ms', *names], strict=True))
+    assert read_csv(file, arm26, columns, {'tension': 'kN'})[1][-1].unit == 'kN'
 
 
 def test_rows_without_a_value_are_left_out_and_counted(arm26, tmp_path):
