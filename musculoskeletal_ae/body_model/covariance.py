@@ -156,14 +156,16 @@ def _drawn_errors(
     bodies = np.repeat(np.arange(BODIES), POSTURES_PER_BODY)
     tension = tension[rng.integers(len(tension), size=len(bodies))]
     direction = UNKNOWN_FRICTION * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
+    # The network gets bone-side tensions, and the body computes lengths from readings.
+    read = body.transmission.reading(tension, np.zeros_like(tension))
     poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
-    length += body.remainder.at(theta, tension) + body.remainder.drawn_error(theta, tension, rng)
+    length += body.remainder.at(theta, read) + body.remainder.drawn_error(theta, read, rng)
     offset = np.zeros((BODIES, theta.shape[1]))
     for group, (muscles, root) in zip(body.robot.groups, fit.root, strict=True):
         steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
         ends = np.cumsum([body.layouts[m].size for m in muscles])
         for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
-            observed, slope = body.linearised(poses, tension[:, m], direction[:, m], m)
+            observed, slope = body.linearised(poses, read[:, m], direction[:, m], m)
             length[:, m] += observed + (slope * step[bodies]).sum(axis=1)
         joints = list(group.joints)
         offset[:, joints] = steps[:, ends[-1] : ends[-1] + len(joints)]

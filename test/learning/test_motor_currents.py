@@ -2,6 +2,7 @@
 """Scale, offset and drive friction of motor currents are learned from rests."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from robots import with_modules
 
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.covariance import drive_covariance
+from musculoskeletal_ae.body_model.covariance import drive_covariance, estimate_covariance
 from musculoskeletal_ae.body_model.fit import fit_to_network
 from musculoskeletal_ae.body_model.observations import Observations, Sample
 from musculoskeletal_ae.control.limiter import CONFIDENCE
@@ -70,6 +71,25 @@ def test_tensions_of_currents_are_recovered_from_rests(seed):
     assert after < 0.4 * before
     error = np.abs(body.drive[2] - true.drive[2]).mean()  # error of the drive friction [N]
     assert error < 0.5 * np.abs(0.08 * LIMIT - true.drive[2]).mean() + 0.01 * LIMIT.mean()
+
+
+def test_the_covariance_of_the_estimate_has_no_error_from_known_constants_of_currents():
+    tension = np.random.default_rng(0).uniform(0.1, 0.6, (50, COUNT)) * LIMIT
+    # The posterior is so narrow that all drawn bodies are alike.
+    sizes = sum(layout.size for layout in CalibratedBody(ROBOT).layouts) + ROBOT.joint_count
+    root = [(np.arange(COUNT), 1e9 * np.eye(sizes))]
+    fit = SimpleNamespace(noise=np.full(COUNT, 1e-4), root=root)
+
+    def lengths_as_angles(_, length):
+        return SimpleNamespace(theta=length[:, : ROBOT.joint_count])
+
+    mae, covariances = SimpleNamespace(estimate=lengths_as_angles), []
+    for gain, offset in ((0.0, 0.0), (0.5, 0.05)):
+        body = CalibratedBody(ROBOT)
+        for layout, parameters in zip(body.layouts, body.parameters, strict=True):
+            parameters[layout.drive] = gain, offset, 0.0
+        covariances.append(estimate_covariance(mae, body, fit, tension, 0, None))
+    np.testing.assert_allclose(covariances[1], covariances[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize('count', [0, 20, 120])
