@@ -119,15 +119,17 @@ def contradicted_muscles(observed: Observations, fit: FittedBody) -> tuple[tuple
     enough earlier samples exist.
 
     Returns:
-        The index of each such muscle, and the number of its newest samples with such residuals.
+        The index of each such muscle, and the number of the first sample from which on all its
+        samples have such residuals (`Observations.number`).
     """
     muscles = []
     for m, noise in enumerate(fit.noise):
-        residual = fit.residual[observed.known[:, m], m]
+        known = observed.known[:, m]
+        residual = fit.residual[known, m]
         odd = np.abs(residual) > max(OUTLIER * noise, LEAST_CHANGE)
         same = odd & (np.sign(residual) == np.sign(residual[-1])) if len(residual) else odd
         fits = np.flatnonzero(~same)
         run = len(same) - 1 - fits[-1] if len(fits) else 0
         if run >= LEAST_NEWEST and len(same) - run >= LEAST_BEFORE:
-            muscles.append((m, int(run)))
+            muscles.append((m, int(observed.number[known][-run])))
     return tuple(muscles)

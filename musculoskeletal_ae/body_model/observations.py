@@ -46,6 +46,8 @@ class Observations:
     gravity: Array = field(default_factory=lambda: NOTHING)
     #: number of samples that came after each one, (N,); 0 where creep cannot be estimated
     age: Array = field(default_factory=lambda: NOTHING)
+    #: number of each sample in the order of acceptance (`StoredSample`), (N,)
+    number: Ints = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def __post_init__(self) -> None:
         """Replace empty arrays by defaults."""
@@ -55,6 +57,8 @@ class Observations:
             object.__setattr__(self, 'gravity', np.zeros((len(self.theta), 0)))
         if self.age.size == 0:
             object.__setattr__(self, 'age', np.zeros(len(self.theta)))
+        if self.number.size == 0:
+            object.__setattr__(self, 'number', 1 + np.arange(len(self.theta)))
 
     def __len__(self) -> int:
         return len(self.theta)

@@ -306,8 +306,8 @@ class Learner:
         if self.impossible_offsets:
             self.refused += 1
             return
-        for muscle, newest in update.changed:
-            self._forget(muscle, newest)
+        for muscle, first in update.changed:
+            self._forget(muscle, first)
         self.keeper.use(mae)
 
     def note_accepted(self, mae: Mae) -> None:
@@ -319,12 +319,12 @@ class Learner:
         """Note that the estimator has rejected the network of this version, and why."""
         self.keeper.note_rejected(version, reason)
 
-    def _forget(self, muscle: int, newest: int = 0) -> None:
-        """Forget a muscle in all samples but the last `newest`, and schedule an update.
+    def _forget(self, muscle: int, before: float = math.inf) -> None:
+        """Forget a muscle in the samples with numbers below `before`, and schedule an update.
 
         All messages of the healthy arm are discarded.
         """
-        self.samples.forget(muscle, newest)
+        self.samples.forget(muscle, before)
         self.collector.healthy.clear()
         self.scheduler.note_change()
 

@@ -125,10 +125,11 @@ class SampleStore:
         if len(self.stored) > self.capacity:
             del self.stored[self._dispensable()]
 
-    def forget(self, muscle: int, newest: int = 0) -> None:
-        """Forget what all but the last `newest` samples say about a muscle."""
-        for each in (*self.stored[: len(self.stored) - newest], *self.held):
-            each.known[muscle] = False
+    def forget(self, muscle: int, before: float = math.inf) -> None:
+        """Forget what the samples with numbers below `before` say about a muscle."""
+        for each in (*self.stored, *self.held):
+            if each.number < before:
+                each.known[muscle] = False
 
     def hold(self, now: float) -> None:
         """Hold back the samples of the last `HELD_TIME`, because offsets were revoked at `now` [s].
@@ -206,13 +207,14 @@ class SampleStore:
         theta, tension, length, direction = map(np.array, columns[:4])
         spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)
         known = np.array([each.known for each in self.stored])
-        age = self.stored[-1].number - np.array([each.number for each in self.stored], float)
+        number = np.array([each.number for each in self.stored])
+        age = (number[-1] - number).astype(float)
         # Do not estimate creep without joint angles, because a drift of the estimated postures
         # would look like creep.
         read = np.isfinite(theta).all(axis=1).mean()
         if self.accepted <= CREEP_SHARE * self.capacity or read < CREEP_SHARE:
             age[:] = 0.0
-        return Observations(theta, tension, length, direction, known, spread, gravity, age)
+        return Observations(theta, tension, length, direction, known, spread, gravity, age, number)
 
     def _dispensable(self) -> int:
         """Return the index of the older one of the two most similar samples."""

@@ -46,8 +46,8 @@ class Update(NamedTuple):
     loss: float  # training loss
     #: σ of the part of each length that the body does not explain [m], (M,)
     noise: Array = np.empty(0)
-    #: index of a muscle whose newest samples contradict the fitted body, and the number of these
-    #: newest samples; at most one entry
+    #: index of a muscle whose newest samples contradict the fitted body, and the number of the
+    #: first of these samples (`Observations.number`); at most one entry
     changed: tuple[tuple[int, int], ...] = ()
     #: mean 2-norms of θ_est − θ at the newest samples, over the revolute and over the prismatic
     #: joints (`JointUnits.mean_errors`), with θ_est of the network before the update [rad], (2,)

@@ -248,9 +248,13 @@ def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learn
 
 def test_a_changed_muscle_is_relearned_from_the_samples_since_its_change(learner, stage):
     accept(learner, stage, 6)
-    learner.trainer.calibrated, learner.trainer.changed = True, ((1, 4),)
+    learner.trainer.calibrated, learner.trainer.changed = True, ((1, 3),)
+    learner.trainer.released = False
     learner.poll(0.0)
-    assert [bool(each.known[1]) for each in learner.samples.stored] == [False] * 2 + [True] * 4
+    accept(learner, stage, 2)  # during the update, which finds that sample 3 is of a changed muscle
+    learner.trainer.released = True
+    learner.poll(0.5)
+    assert [bool(each.known[1]) for each in learner.samples.stored] == [False] * 2 + [True] * 6
     assert not calibrated(learner)
 
 

@@ -99,7 +99,7 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
         plain._replace(spread=np.full(2, 0.02), gravity=gravity),
     ):
         store.add(sample)
-    store.forget(1, newest=1)
+    store.forget(1, before=2)
     with closing(StateStore(tmp_path, arm26)) as state:
         state.save(store, checkpoint.to_bytes(replace(initial, version=7)))
     loaded, mae, not_used = read(tmp_path, arm26)
@@ -246,7 +246,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     for _ in range(4):
         theta, *parts, spread, gravity = stage.sample()
         store.add(Sample(theta, *(part[kept] for part in parts), spread, gravity))
-    store.forget(0, newest=1)
+    store.forget(0, before=4)
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
     with closing(Learner(arm26, initial, directory=tmp_path, trainer=IdleTrainer)) as learner:
