@@ -181,7 +181,7 @@ class SampleStore:
         """
         recent = {
             each.number: float(each.sample.theta[joint])
-            for each in self.stored
+            for each in (*self.stored, *self.held)
             if each.time >= since
         }
         removed = {number: angle for number, angle in recent.items() if np.isfinite(angle)}
@@ -190,11 +190,12 @@ class SampleStore:
 
     def _set_angles(self, joint: int, angles: Mapping[int, float]) -> None:
         """Set θ of a joint [rad] in some samples, by number."""
-        for place, each in enumerate(self.stored):
-            if each.number in angles:
-                theta = each.sample.theta.copy()
-                theta[joint] = angles[each.number]
-                self.stored[place] = each._replace(sample=each.sample._replace(theta=theta))
+        for samples in (self.stored, self.held):
+            for place, each in enumerate(samples):
+                if each.number in angles:
+                    theta = each.sample.theta.copy()
+                    theta[joint] = angles[each.number]
+                    samples[place] = each._replace(sample=each.sample._replace(theta=theta))
 
     def clear(self) -> None:
         """Clear all samples, after which their numbers begin at 1 again."""

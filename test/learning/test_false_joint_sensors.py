@@ -58,6 +58,20 @@ def test_readings_of_the_doubtful_time_come_back_if_the_user_confirms_them(taugh
     assert (elbows(samples) == before).all()
 
 
+def test_readings_of_samples_that_were_held_back_come_back_as_well(taught):
+    samples = taught.samples
+    samples.offset = np.zeros(6)
+    before = elbows(samples)
+    samples.hold(10.0)
+    taught.use(trust(SensorTrust.DOUBTED, 6.0))
+    samples.use_offset(np.zeros(6))
+    assert np.isnan(elbows(samples)[5:]).all()
+    samples.hold(10.0)
+    taught.use(trust(SensorTrust.CONFIRMED, 6.0))
+    samples.use_offset(np.zeros(6))
+    assert (elbows(samples) == before).all()
+
+
 def test_readings_during_impossible_ones_are_given_up_even_if_the_sensor_was_confirmed(taught):
     samples = taught.samples
     taught.use(trust(SensorTrust.CONFIRMED, 2.0))
