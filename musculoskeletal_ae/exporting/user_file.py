@@ -55,7 +55,7 @@ class UserFile:
     def _read(self, file: Path) -> None:
         if file in self.texts:
             return
-        self.texts[file] = file.read_text(encoding='utf-8')
+        self.texts[file] = file.read_bytes().decode('utf-8')  # the ends of its lines stay
         for match in INCLUDE.finditer(_without_comments(self.texts[file])):
             self._read(self._included(file, match[1]))
 
@@ -137,14 +137,19 @@ class UserFile:
         copies, folders = self._copies(), self._asset_folders()
         texts = {file: self._placed_elsewhere(file, copies, folders) for file in self.texts}
         model = self.model
-        if not folders and any((model.nmesh, model.ntex, model.nhfield, model.nskin)):
-            stated = ' '.join(f'{key}="{self.file.parent}"' for key in FOLDERS[:2])
+        # The default of an unstated folder is that of the file, and the copy lies elsewhere.
+        is_used = {'meshdir': model.nmesh or model.nhfield or model.nskin, 'texturedir': model.ntex}
+        unstated = [key for key, used in is_used.items() if used and key not in folders]
+        if unstated and 'assetdir' not in folders:
+            stated = ' '.join(f'{key}="{self.file.parent}"' for key in unstated)
+            text = texts[self.file]
+            end = '\r\n' if '\r\n' in text else '\n'
             head = re.compile(r'(<mujoco\b[^>]*>)')
-            texts[self.file] = head.sub(rf'\1\n  <compiler {stated}/>', texts[self.file], count=1)
+            texts[self.file] = head.sub(rf'\1{end}  <compiler {stated}/>', text, count=1)
         for file, text in texts.items():
             copy = folder / copies[file]
             copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_text(text, encoding='utf-8')
+            copy.write_bytes(text.encode('utf-8'))
         result = folder / copies[self.file]
         try:
             mujoco.MjModel.from_xml_path(str(result))

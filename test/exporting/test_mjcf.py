@@ -145,6 +145,23 @@ def test_meshes_are_found_wherever_an_included_file_places_them(tmp_path):
     assert written == MESHES.replace('../outside/site.xml', 'site.xml')
 
 
+def test_meshes_beside_a_file_that_states_another_folder_for_textures_only_are_found(tmp_path):
+    text = (
+        '<mujoco>\r\n  <compiler texturedir="textures"/>\r\n  <asset>\r\n'
+        '    <mesh name="tip" file="tip.obj"/>\r\n  </asset>\r\n'
+        '  <worldbody><body><geom type="mesh" mesh="tip"/></body></worldbody>\r\n</mujoco>\r\n'
+    )
+    home, copy = tmp_path / 'home', tmp_path / 'copy'
+    for folder in (home, copy):
+        folder.mkdir()
+    (home / 'mine.xml').write_bytes(text.encode())
+    (home / 'tip.obj').write_text(CUBE)
+    written = UserFile(home / 'mine.xml').write(copy)
+    assert mujoco.MjModel.from_xml_path(str(written)).nmesh == 1
+    content = written.read_bytes().decode()
+    assert content.count('\r\n') == content.count('\n') == text.count('\n') + 1
+
+
 def test_another_file_is_refused(learned):
     robot, _, mae, folder = learned
     (folder / 'other.xml').write_text('<mujoco><worldbody/></mujoco>')
