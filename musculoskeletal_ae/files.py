@@ -9,6 +9,7 @@ default, it is that of `file_error`.
 import csv
 import fcntl
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -195,8 +196,8 @@ def _check(text: str) -> None:
 def new_directory(directory: Path, refuse: Refuse = file_error) -> Iterator[None]:
     """Create a directory into which a `with` block writes files; an empty one may exist already.
 
-    After an error or Ctrl-C, the files are removed again, and the directory if it was new, so that
-    no partial result remains.
+    After an error or Ctrl-C, its files and folders are removed again, and the directory if it was
+    new, so that no partial result remains.
     """
     is_there = os.path.lexists(directory)
     if is_there and (not directory.is_dir() or any(directory.iterdir())):
@@ -205,8 +206,11 @@ def new_directory(directory: Path, refuse: Refuse = file_error) -> Iterator[None
     try:
         yield
     except BaseException:
-        for file in directory.iterdir():
-            file.unlink()
+        for entry in directory.iterdir():
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
         if not is_there:
             directory.rmdir()
         raise

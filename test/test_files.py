@@ -224,3 +224,5 @@ def test_a_directory_of_results_is_complete_or_as_before(tmp_path, is_there):
     with pytest.raises(Refused, match='new or empty'), files.new_directory(directory, refuse):
         pass
     assert (directory / 'file').read_text() == 'everything'
+        (directory / 'folder').mkdir()
+        (directory / 'folder' / 'file').write_text('a part')
