@@ -239,8 +239,7 @@ def locked(file: Path) -> TextIO:
 def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
     """Write a file atomically: a reader sees the old content or the new content, never a part.
 
-    If `previous` is set, the old file is first renamed to it. For a moment between the two renames,
-    only `previous` exists.
+    If `previous` is set, it becomes the old file. At every moment, `file` exists if it did before.
     """
     descriptor, temporary = tempfile.mkstemp(dir=file.parent, prefix=f'.{file.name}.')
     try:
@@ -250,7 +249,7 @@ def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
             os.fchmod(stream.fileno(), 0o644)  # mkstemp lets only the owner read the file
             os.fsync(stream.fileno())
         if previous is not None and file.exists():
-            file.replace(previous)
+            _keep(file, previous, Path(f'{temporary}.previous'))
         Path(temporary).replace(file)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
@@ -261,3 +260,21 @@ def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
         os.fsync(directory)
     finally:
         os.close(directory)
+
+
+def _keep(file: Path, previous: Path, temporary: Path) -> None:
+    """Make `previous` the same file, atomically, before the file is replaced.
+
+    `temporary` is a new name in the same folder.
+    """
+    try:
+        try:
+            temporary.hardlink_to(file)
+        except OSError:  # this file system has no hard links
+            shutil.copy2(file, temporary)
+            with temporary.open('rb') as copy:
+                os.fsync(copy.fileno())
+        temporary.replace(previous)
+    finally:
+        if temporary.exists():  # `replace` leaves it if both were links to one file already
+            temporary.unlink()

@@ -2,6 +2,7 @@
 """Files of users are read within limits, or rejected with an error that names the file."""
 
 import os
+from pathlib import Path
 
 import pytest
 import yaml
@@ -191,6 +192,33 @@ def test_a_file_is_replaced_whole_and_the_one_before_it_kept(tmp_path):
     assert set(tmp_path.iterdir()) == {file, previous}
 
 
+@pytest.mark.parametrize('has_links', [True, False])
+def test_a_writer_that_is_killed_leaves_the_file(has_links, tmp_path, monkeypatch):
+    file, previous = tmp_path / 'a', tmp_path / 'before'
+    files.write_whole(file, b'0', previous)
+    replace, seen = Path.replace, []
+
+    def record(self, target):
+        done = replace(self, target)
+        seen.append((file.read_bytes(), previous.exists() and previous.read_bytes()))
+        return done
+
+    def refuse_link(*_):
+        raise PermissionError('no links')
+
+    monkeypatch.setattr(Path, 'replace', record)
+    if not has_links:
+        monkeypatch.setattr(os, 'link', refuse_link)
+    files.write_whole(file, b'1', previous)
+    assert seen == [(b'0', b'0'), (b'1', b'0')]
+    monkeypatch.undo()
+    previous.unlink()
+    previous.hardlink_to(file)  # as a kill between the two steps leaves them
+    files.write_whole(file, b'2', previous)
+    assert (file.read_bytes(), previous.read_bytes()) == (b'2', b'1')
+    assert set(tmp_path.iterdir()) == {file, previous}
+
+
 def test_a_file_that_cannot_be_written_leaves_the_one_before_it(tmp_path, monkeypatch):
     file, previous = tmp_path / 'a', tmp_path / 'before'
     files.write_whole(file, b'1', previous)
@@ -214,6 +242,8 @@ def test_a_directory_of_results_is_complete_or_as_before(tmp_path, is_there):
     @files.new_directory(directory, refuse)
     def interrupted():
         (directory / 'file').write_text('a part')
+        (directory / 'folder').mkdir()
+        (directory / 'folder' / 'file').write_text('a part')
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -224,5 +254,3 @@ def test_a_directory_of_results_is_complete_or_as_before(tmp_path, is_there):
     with pytest.raises(Refused, match='new or empty'), files.new_directory(directory, refuse):
         pass
     assert (directory / 'file').read_text() == 'everything'
-        (directory / 'folder').mkdir()
-        (directory / 'folder' / 'file').write_text('a part')
