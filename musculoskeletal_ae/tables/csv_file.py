@@ -12,7 +12,7 @@ import csv
 import io
 import re
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +118,7 @@ def _read_cells(file: Path) -> tuple[list[str], Array]:
             cells = [cell.strip() for cell in cells]
             if not headers:
                 headers = cells
-                if all(map(_is_number, cells)):
+                if _are_readings(cells):
                     headers = [f'#{place}' for place in range(1, len(cells) + 1)]
                 else:
                     _check_headers(headers)
@@ -155,6 +155,12 @@ def _comma_hint(delimiter: str, cells: int, headers: int) -> str:
     if delimiter == ',' and cells > headers:
         return '. If commas are decimal commas, separate the cells by semicolons'
     return ''
+
+
+def _are_readings(cells: Sequence[str]) -> bool:
+    """Return whether the cells of a row are numbers and missing values, and not headers."""
+    given = [cell for cell in cells if cell.lower() not in NOTHING]
+    return bool(given) and all(map(_is_number, given))
 
 
 def _is_number(cell: str) -> bool:
