@@ -105,11 +105,13 @@ class Table:
         for array in (*values.values(), when):
             array[~np.isfinite(array)] = np.nan
         left_out, usable = {}, np.ones(count, dtype=bool)
+        gaps = {name: np.isnan(array) for name, array in values.items()}
+        nowhere = np.zeros((count, 1), dtype=bool)
         for reason, missing in (
-            ('a length is missing', np.isnan(values['length']).any(axis=1)),
-            ('a tension is missing', np.isnan(values.get('tension', when[:, None])).any(axis=1)),
+            ('a length is missing', gaps['length'].any(axis=1)),
+            ('a tension is missing', gaps.get('tension', nowhere).any(axis=1)),
             ('the time is missing', np.isnan(when)),
-            ('no joint position is known', np.isnan(values['position']).all(axis=1)),
+            ('no joint position is known', gaps['position'].all(axis=1)),
         ):
             if (lost := missing & usable).any():
                 left_out[reason] = int(lost.sum())

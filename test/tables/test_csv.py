@@ -259,6 +259,20 @@ def test_training_from_a_table_of_rests_with_unknown_zeros_lowers_the_held_out_e
     assert load(trained.out, arm26).joints == tuple(arm26.joints)
 
 
+def test_joint_positions_with_another_zero_are_named_and_nothing_is_written(
+    arm26, trained, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(learner, 'LARGEST_OFFSET', 0.1)  # reached after few updates
+    rows = readings(arm26, 60)
+    rows[:, 1] -= 0.5
+    assert trained(write(tmp_path / 'a.csv', headers(arm26), rows)) == 1
+    printed = capsys.readouterr().err
+    assert re.search(r'nothing was learned \(2 updates\): 2 of 2 updates were refused', printed)
+    assert re.search(r'elbow \(-0\.\d+ rad, largest 0\.10\)', printed)
+    assert 'shoulder (' not in printed
+    assert not trained.out.exists()
+
+
 def test_wrong_units_and_signs_are_named_before_the_training(
     arm26, trained, tmp_path, capsys, monkeypatch
 ):
@@ -283,20 +297,6 @@ def test_preset_paper_says_that_it_does_not_learn_from_20_postures(
     file = write(tmp_path / 'a.csv', headers(arm26), readings(arm26, 25))  # 20 are learned
     out = tmp_path / 'out.safetensors'
     options = ['--checkpoint', str(trained_files['paper']), '--out', str(out), '--preset', 'paper']
-def test_joint_positions_with_another_zero_are_named_and_nothing_is_written(
-    arm26, trained, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setattr(learner, 'LARGEST_OFFSET', 0.1)  # reached after few updates
-    rows = readings(arm26, 60)
-    rows[:, 1] -= 0.5
-    assert trained(write(tmp_path / 'a.csv', headers(arm26), rows)) == 1
-    printed = capsys.readouterr().err
-    assert re.search(r'nothing was learned \(2 updates\): 2 of 2 updates were refused', printed)
-    assert re.search(r'elbow \(-0\.\d+ rad, largest 0\.10\)', printed)
-    assert 'shoulder (' not in printed
-    assert not trained.out.exists()
-
-
     assert main(['--robot', 'arm26', '--from-csv', str(file), *options]) == 1
     expected = '20 different resting postures, and preset paper learns from at least 21'
     assert expected in capsys.readouterr().err
@@ -315,6 +315,9 @@ def test_files_of_a_robot_without_tension_sensors_need_no_tensions(tmp_path, arm
     names, rows = headers(robot)[:8], readings(robot)[:, :8]
     table, _ = read_csv(write(tmp_path / 'a.csv', names, rows), robot)
     np.testing.assert_allclose(table.rows.tension[0], robot.actuation.assumed_tension)
+    time = np.r_[0.0, np.nan, np.arange(2, 100)]
+    table, _ = read_csv(write(tmp_path / 'b.csv', ['time', *names], np.c_[time, rows]), robot)
+    assert table.left_out == {'the time is missing': 1}
 
 
 @pytest.mark.parametrize(
