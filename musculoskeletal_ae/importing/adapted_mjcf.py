@@ -218,6 +218,7 @@ class AdaptedModel:
             parent.remove(ball)
             same = {
                 'pos': ball.attrib['pos'], 'ref': '0', 'springref': '0',
+                'limited': 'false',  # the file may have defaults for the ranges of other joints
                 'stiffness': _text(model.jnt_stiffness[j]),
                 'damping': _text(model.dof_damping[dof]),
                 'armature': _text(model.dof_armature[dof]),

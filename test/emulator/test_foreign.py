@@ -368,6 +368,18 @@ def test_a_ball_joint_becomes_the_three_hinges_that_it_is_imported_as(tmp_path):
     np.testing.assert_allclose(lengths, robot.routes.absolute_lengths(theta), atol=1e-9)
 
 
+def test_a_ball_joint_does_not_get_the_default_range_of_other_joints(tmp_path):
+    end = ' ref="0.2" limited="true"/>'
+    first = '<joint name="swing" axis="0 1 0" range="-1 1.2" pos="0 0 0.01"'
+    second = '<joint name="lift" axis="1 0.1 0" range="-0.6 0.6" limited="true"/>'
+    text = bodies.MJCF.replace(f'{first}{end}', '<joint name="ball" type="ball" range="0 0.6"/>')
+    default = '<default><joint range="-0.1 0.1"/></default><worldbody>'
+    robot = import_text(tmp_path, text.replace(second, '').replace('<worldbody>', default))
+    model = mujoco.MjModel.from_xml_path(str(model_of(robot)))
+    hinges = [model.joint(name).id for name in ('ball_x', 'ball_y', 'ball_z')]
+    assert not model.jnt_limited[hinges].any()
+
+
 #: MJCF file for <include>, whose bodies and joints have no names
 PART = """<mujoco><site name="o" pos=".05 0 1"/><site name="o2" pos="-.05 0 1"/>
   <body pos="0 0 1"><joint axis="0 1 0" range="-60 60"/><geom size=".02" fromto="0 0 0 0 0 -.2"
