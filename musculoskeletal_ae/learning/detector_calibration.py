@@ -77,6 +77,8 @@ class Reservoir:
         muscles: int,
         seed: int = 0,
         capacity: int = CAPACITY,
+        *,
+        of_currents: bool = False,
     ) -> None:
         """Create an empty reservoir.
 
@@ -84,7 +86,9 @@ class Reservoir:
             muscles: Number of muscles.
             seed: Seed of the random selection.
             capacity: Largest number of messages.
+            of_currents: Whether tensions are converted motor currents, which may be negative.
         """
+        self._of_currents = of_currents
         self._rng = np.random.default_rng([seed, 0x4E])
         self._muscles, self._capacity = muscles, capacity
         self._kept: list[NDArray[np.float32]] = []
@@ -160,7 +164,8 @@ class Reservoir:
         age = self._rests.accepted - number[:, 0]
         recent = (time[:, 0] > self.time - RECENT_TIME) & (age < RECENT_RESTS)
         # Exclude tensions of 0 N, which mean that the muscle was isolated or slack.
-        whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
+        pulls = tension != 0.0 if self._of_currents else tension > 0.0
+        whole = recent & np.isfinite(theta).all(axis=1) & pulls.all(axis=1)
         known = np.ones(tension.shape, dtype=bool)
         observed = Observations(theta, tension, length, direction, known, age=age)
         place, second = np.flatnonzero(whole), np.arange(len(rows))[whole] % 2

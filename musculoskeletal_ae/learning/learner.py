@@ -107,7 +107,8 @@ class Learner:
         self._steps = steps
         self._polled_at = math.inf  # time of the last poll [s]
         self.trainer = trainer(robot, preset, seed)
-        samples, healthy = SampleStore(), Reservoir(robot.muscle_count, seed)
+        samples, of_currents = SampleStore(), robot.tension_source.is_current
+        healthy = Reservoir(robot.muscle_count, seed, of_currents=of_currents)
         self.collector = SampleCollector(
             robot, samples, healthy, period, joint_source, from_motion=from_motion
         )

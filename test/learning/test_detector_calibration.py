@@ -121,6 +121,15 @@ def test_messages_that_do_not_determine_the_posture_are_not_learned(unfit):
     np.testing.assert_array_equal(observed.learned.length[:, 0], [6, 8])
 
 
+def test_messages_with_negative_motor_currents_are_learned_but_not_negative_tensions():
+    for of_currents in (False, True):
+        reservoir = Reservoir(3, of_currents=of_currents)
+        for n in range(10):
+            reservoir.step(reading(float(n), tension=-3.0 if n < 6 else 50.0), 0.1)
+        observed = reservoir.healthy()
+        assert len(observed.learned) + len(observed.judging) == (10 if of_currents else 4)
+
+
 def test_messages_of_long_ago_are_not_learned_and_the_others_have_an_age():
     reservoir = Reservoir(3, capacity=20_000)
     for n in range(4):
