@@ -244,8 +244,7 @@ class _Points(NamedTuple):
     @property
     def is_complete(self) -> Bools:
         """Whether all angles of each sample were measured, (N,)."""
-        complete: Bools = np.isfinite(self.theta).all(axis=1)
-        return complete
+        return np.asarray(np.isfinite(self.theta).all(axis=1))
 
     def differences(self, place: int) -> Array:
         """Return how θ, T and l of all samples differ from those of one, (N, D + 2 M).
