@@ -273,6 +273,18 @@ def test_joint_positions_with_another_zero_are_named_and_nothing_is_written(
     assert not trained.out.exists()
 
 
+def test_a_refusal_of_the_last_update_is_a_warning_if_earlier_ones_were_used(
+    arm26, trained, tmp_path, capsys, monkeypatch
+):
+    def found(self):
+        return {'elbow': '0.50 rad, largest 0.35'} if self.updates == 2 else {}
+
+    monkeypatch.setattr(learner.Learner, 'impossible_offsets', property(found))
+    assert trained(write(tmp_path / 'a.csv', headers(arm26), readings(arm26, 60))) == 0
+    assert 'warning: 1 of 2 updates were refused' in capsys.readouterr().err
+    assert trained.out.exists()
+
+
 def test_wrong_units_and_signs_are_named_before_the_training(
     arm26, trained, tmp_path, capsys, monkeypatch
 ):
