@@ -109,8 +109,8 @@ def train(args: Namespace) -> None:
     if why := _nothing_learned(learner, at_rest):
         _warn(warnings)
         raise MusculoskeletalError(f'{why}; {args.out} was not written')
-    if refused := unchanged(learner):
-        warnings.append(refused)
+    if learner.impossible_offsets:
+        warnings.append(unchanged(learner))
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(_learned(learner))
     zero = (
@@ -383,10 +383,10 @@ def _nothing_learned(learner: Learner, at_rest: bool) -> str:
 
     `at_rest` says whether the recording consists of resting postures only.
     """
-    why = unchanged(learner)
-    if not why or (learner.impossible_offsets and learner.updates > learner.refused):
+    last = learner.last_update
+    if learner.updates > learner.refused and not (last and last.unchanged):
         return ''
-    why = f'nothing was learned ({learner.updates} updates): {why}'
+    why = f'nothing was learned ({learner.updates} updates): {unchanged(learner)}'
     if learner.impossible_offsets:
         return why
     rest = '' if at_rest else f' and rests in each for at least {REST_TIME:g} s'
