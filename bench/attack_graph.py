@@ -236,7 +236,8 @@ class Attack:
         if 'checkpoint' in PARAMETERS[name]:
             parameters.append(f'checkpoint:={self.initial}')
         words = [part for parameter in parameters for part in ('-p', parameter)]
-        command = [sys.executable, '-c', RUN, name, '--ros-args', '-r', f'__ns:={self.namespace}']
+        python = [sys.executable, '-X', 'faulthandler']  # a crash prints the stacks of all threads
+        command = [*python, '-c', RUN, name, '--ros-args', '-r', f'__ns:={self.namespace}']
         file = self.folder / f'{log or name}.log'
         return Process(name, [*command, *remapping, *words], file)
 

@@ -155,8 +155,8 @@ class Arrival:
         self._sent, self.number, self.received_at = sent, number, now
         return True
 
-    def resubscribed(self) -> None:
-        """Accept messages that were received before, because a new subscription repeats them."""
+    def forget_order(self) -> None:
+        """Take the next message for a new one, whoever sent the messages before it."""
         self._sent = self.number = 0
 
     def use(self, now: float) -> None:

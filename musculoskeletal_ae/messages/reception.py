@@ -57,7 +57,6 @@ class Reception:
             is_used_at_once: If false, the code that uses the message records its use later.
         """
         arrival = self.arrivals[topic]
-        arrival.resubscribed()
 
         def is_from_one() -> bool:
             return publishers() == 1

@@ -30,6 +30,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, REJECTED
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.ros.latched_values import LatchedPublisher
 from musculoskeletal_ae.ros.message_building import LATCHED, bytes_message
 
 
@@ -49,8 +50,8 @@ class Candidates:
         """
         self._node, self._networks = node, networks
         networks.rejected = self._reject
-        self._accepted = node.create_publisher(UInt8MultiArray, ACCEPTED, LATCHED)
-        self._rejected = node.create_publisher(KeyValue, REJECTED, LATCHED)
+        self._accepted = LatchedPublisher(node, UInt8MultiArray, ACCEPTED)
+        self._rejected = LatchedPublisher(node, KeyValue, REJECTED)
         self.queue = node.checkpoint_queue(CANDIDATES, self._validate)
 
     def subscribe(self) -> None:

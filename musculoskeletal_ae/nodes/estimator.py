@@ -36,8 +36,8 @@ from musculoskeletal_ae.nodes.arm_node import Markers
 from musculoskeletal_ae.nodes.candidates import Candidates
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
+from musculoskeletal_ae.ros.latched_values import LatchedPublisher
 from musculoskeletal_ae.ros.message_building import (
-    LATCHED,
     RELIABLE,
     SENSOR,
     array_message,
@@ -107,8 +107,8 @@ class EstimatorNode(Shell):
         self.anomaly = publisher(Float64, 'anomaly', RELIABLE)
         self.wrench = publisher(WrenchStamped, 'estimated_external_wrench', RELIABLE)
         self.by_camera = publisher(JointState, 'vision_joint_states', RELIABLE)
-        self.bodies = publisher(Float64MultiArray, 'body_state', LATCHED)
-        self.trust = publisher(Float64MultiArray, 'joint_sensor_trust', LATCHED)
+        self.bodies = LatchedPublisher(self, Float64MultiArray, 'body_state')
+        self.trust = LatchedPublisher(self, Float64MultiArray, 'joint_sensor_trust')
         self.mirror = None
         if self.parameter('mirror_muscles'):
             self.mirror = publisher(JointState, 'muscle_joint_states', RELIABLE)

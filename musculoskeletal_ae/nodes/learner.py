@@ -25,6 +25,7 @@ from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.ros.latched_values import LatchedPublisher
 from musculoskeletal_ae.ros.message_building import LATCHED, SENSOR, bytes_message, serve
 
 MOST_DIGITS = 15  # reject a version of a network with more digits
@@ -75,7 +76,7 @@ class LearnerNode(Shell):
         self.listen(UInt8MultiArray, ACCEPTED, self._decisions.propose, LATCHED)
         self.listen(KeyValue, REJECTED, self._use_rejected, LATCHED)
         # The graph shows this publisher when the node is ready to report.
-        self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        self.publisher = LatchedPublisher(self, UInt8MultiArray, 'mae_checkpoint')
         self.sources.watch('mae_checkpoint')
         self.create_timer(POLL_PERIOD, self._poll, clock=STEADY)
 

@@ -55,6 +55,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.ros.executor import parameter_overrides
+from musculoskeletal_ae.ros.latched_values import LatchedRequests
 from musculoskeletal_ae.ros.message_building import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.ros.needed_topics import NeededTopics
 from musculoskeletal_ae.ros.second_publishers import (
@@ -120,13 +121,12 @@ class Shell(Node):
         self._reception = Reception(
             lambda text: warn(f'{text} (counted in /diagnostics)'), self.awake
         )
-        #: subscription of each latched topic, and a function that subscribes again
-        self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}
+        self._latched_requests = LatchedRequests(self)
         self.sources = Sources(
             self,
             self.full_name,
             lambda topic: self._reception.arrivals[topic].turns,
-            self._subscribe_anew,
+            self._request_again,
         )
         self.rejected = self._reception.rejected  # number of messages, by topic and reason
         #: the newest body state that the estimator has published
@@ -134,7 +134,7 @@ class Shell(Node):
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
         self.twins = Twins(self._diagnostics.status_name, self._diagnostics.identity, self.awake)
-        self._reports_of_twins: Any = None  # the subscription, while there may be a twin
+        self._reports_of_twins: Any = None  # the subscription, since a namesake was seen
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report_periodically, clock=STEADY)
         self._fault = '', -math.inf  # the last internal error, and its time [s]
@@ -317,6 +317,7 @@ class Shell(Node):
                 use.
         """
         arrival = self._reception.arrivals[ACCEPTED]
+        used: Any = None  # content of the message whose network is in use
 
         def put_to_use(mae: Mae) -> None:
             try:
@@ -326,9 +327,13 @@ class Shell(Node):
             self.needed.remove(ACCEPTED)
 
         def handle(message: UInt8MultiArray) -> Iterator[None]:
+            nonlocal used
+            if message.data == used:  # another node has requested the network again
+                return
             mae = checkpoint.from_bytes(bytes(message.data), self.robot)
             yield
             put_to_use(mae)
+            used = message.data
 
         def use_file(mae: Mae) -> None:
             if arrival.was_used:
@@ -402,7 +407,7 @@ class Shell(Node):
                 messages may come from another topic (`full_name`).
             callback: Uses the message it is called with, or raises a MusculoskeletalError to
                 refuse it.
-            qos: Quality of service; LATCHED topics can be resubscribed to.
+            qos: Quality of service.
         """
         wire, full, recording = self._wires.get(topic, topic), self.full_name(topic), self.recording
         if topic in AUTHORS and topic not in self.accepted_from_all:
@@ -411,19 +416,13 @@ class Shell(Node):
         if recording is not None:
             callback = _recorded(recording, wire, kind, callback)
 
-        def subscribe() -> Any:
-            receive = self._reception.of(
-                topic,
-                callback,
-                lambda: self.count_publishers(full),
-                is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
-            )
-            raw = recording is not None
-            return self.create_subscription(kind, wire, receive, qos, raw=raw)
-
-        subscription = subscribe()
-        if qos is LATCHED:
-            self._latched[topic] = subscription, subscribe
+        receive = self._reception.of(
+            topic,
+            callback,
+            lambda: self.count_publishers(full),
+            is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
+        )
+        self.create_subscription(kind, wire, receive, qos, raw=recording is not None)
 
     def _from_author(
         self, topic: str, callback: Callable[[Any], object], is_latched: bool
@@ -440,28 +439,27 @@ class Shell(Node):
 
         return take
 
-    def _subscribe_anew(self, topic: str) -> None:
-        """Subscribe anew to a latched topic, to receive its value again."""
-        subscription, subscribe = self._latched[topic]
-        self.destroy_subscription(subscription)
-        self._latched[topic] = subscribe(), subscribe
+    def _request_again(self, topic: str) -> None:
+        """Request the last value of a latched topic, which only one node publishes now."""
+        self._reception.arrivals[topic].forget_order()
+        self._latched_requests.send(self.full_name(topic))
 
     def _look_around(self) -> None:
         self.awake.tick(time.monotonic())
         self.sources.watch(CLOCK)  # `use_sim_time` may be set at any time
         self.sources.look()
-        self._look_for_twins()
+        has_namesake = self._look_for_namesake()
         self.on_intruders(self.intruders)
-        if self._reports_of_twins is None:
-            self._report_changes()
-        else:  # two nodes of one name know each other by their reports, so report often
+        if has_namesake:  # two nodes of one name know each other by their reports, so report often
             self._report()
+        else:
+            self._report_changes()
 
-    def _look_for_twins(self) -> None:
-        """Read the reports of other nodes while the graph has several nodes of this node's name.
+    def _look_for_namesake(self) -> bool:
+        """Return whether the graph has several nodes of this node's name; if so, read reports.
 
-        Otherwise, every node of every arm would receive the reports of all nodes in the graph: with
-        ten arms, 3600 a second.
+        The node reads the reports of all nodes only from the first namesake on. Otherwise, the
+        nodes of ten arms would receive 3600 reports a second.
         """
         parameters = f'{self.get_fully_qualified_name()}/get_parameters'  # a service of every node
         has_namesake = self.count_services(parameters) > 1
@@ -473,9 +471,7 @@ class Shell(Node):
                 MANY_REPORTS,
                 raw=True,
             )
-        elif not has_namesake and self._reports_of_twins is not None:
-            self.destroy_subscription(self._reports_of_twins)
-            self._reports_of_twins = None
+        return has_namesake
 
     @property
     def intruders(self) -> str:

@@ -3,7 +3,8 @@
 
 A message does not name its sender, so this module looks at the ROS graph. While several nodes
 publish a topic of `AUTHORS`, the nodes that use the topic reject its messages and report an ERROR,
-and the controller stops. Afterwards nodes resubscribe to latched topics to receive the value again.
+and the controller stops. Afterwards nodes request the values of latched topics again
+(`latched_values`).
 Only a node that replaces a real arm obeys the commands of several publishers (`ArmNode`).
 
 Two publishers with the same node name do not prove that two nodes run. A killed node stays in the
@@ -193,7 +194,8 @@ class Sources:
             node: Node whose view of the graph is used.
             resolve: Returns the full name of a topic of `AUTHORS`; '' if there is none.
             turns: Returns how often the sequence number of a topic has decreased.
-            renew: Resubscribes to a topic; called when the topic has one publisher again.
+            renew: Requests the last value of a topic; called when the topic has one publisher
+                again.
         """
         self._node, self._resolve = node, resolve
         self._turns, self._renew = turns, renew
@@ -227,8 +229,8 @@ class Sources:
     def look(self) -> None:
         """Look for second publishers on the ROS graph.
 
-        Once a latched topic has no second publisher any more, subscribe to it again, because its
-        messages were rejected before.
+        Once a latched topic has no second publisher any more, request its last value again, because
+        its messages were rejected before.
         """
         for topic in self._authorships:
             self._look(topic)

@@ -118,7 +118,7 @@ class Lockstep:
         spinner.spin_until(lambda: not self.missing(), LONGEST_WAIT)
         for name in self.missing():
             self.lost.append(name)
-            self._node.destroy_client(self._clients.pop(name))
+            del self._clients[name]  # not destroyed, for the reason in `ros/latched_values.py`
             self._warn(
                 f'{name} has not answered for {LONGEST_WAIT:g} s; playing on without waiting for it'
             )

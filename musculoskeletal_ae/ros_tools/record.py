@@ -12,6 +12,7 @@ from copy import copy
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
@@ -114,22 +115,32 @@ class Record(Node):
         self.create_timer(FLUSH_PERIOD, self._look_after, clock=steady)
 
     def _subscribe(self, name: str, qos: QoSProfile) -> None:
-        receive = partial(self._receive, self.resolve_topic_name(name), self._topics[name])
-        self._subscriptions_of[name] = self.create_subscription(
-            message_class(self._topics[name].type), name, receive, qos, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda event: self._on_incompatible(name, event)
-            ),
-        )  # fmt: skip
+        full, topic = self.resolve_topic_name(name), self._topics[name]
 
-    def _on_incompatible(self, name: str, event: QoSRequestedIncompatibleQoSInfo) -> None:
-        self._incompatible[name] = event.last_policy_kind
+        def take(data: bytes, info: dict[str, int]) -> None:
+            if self._subscriptions_of[name] is subscription:
+                self._receive(full, topic, data, info)
+
+        def note_incompatible(event: QoSRequestedIncompatibleQoSInfo) -> None:
+            if self._subscriptions_of[name] is subscription:
+                self._incompatible[name] = event.last_policy_kind
+
+        receive: Any = take
+        subscription: Subscription = self.create_subscription(
+            message_class(topic.type), name, receive, qos, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=note_incompatible),
+        )  # fmt: skip
+        self._subscriptions_of[name] = subscription
 
     def _look_after(self) -> None:
         """Write received messages to disk, count lost messages, and repair subscriptions.
 
         If a publisher offers a weaker QoS than a subscription requests, the subscription receives
-        none of its messages. Such a subscription is replaced by one with the weaker QoS.
+        none of its messages. Such a subscription is replaced by one with the weaker QoS. The old
+        one remains until the end, and its messages are ignored: Fast DDS may crash if a
+        subscription is destroyed while publishers of its topic come and go
+        (`ros/latched_values.py`). A topic has at most three subscriptions, because only two
+        policies can be weakened.
         """
         self.writer.flush()
         self.count_losses()
@@ -143,7 +154,6 @@ class Record(Node):
                 qos.durability = DurabilityPolicy.VOLATILE
             else:  # no other policy of the subscription can be weakened
                 continue
-            self.destroy_subscription(before)
             self._subscribe(name, qos)
 
     def count_losses(self) -> None:

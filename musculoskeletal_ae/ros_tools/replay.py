@@ -5,6 +5,7 @@ import math
 import sys
 import time
 from argparse import Namespace
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -44,7 +45,8 @@ from musculoskeletal_ae.report import (
 )
 from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.ros.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
-from musculoskeletal_ae.ros.message_building import LATCHED, RELIABLE, array_message, serve
+from musculoskeletal_ae.ros.latched_values import LatchedPublisher
+from musculoskeletal_ae.ros.message_building import RELIABLE, array_message, serve
 from musculoskeletal_ae.ros_tools.lockstep import Lockstep
 from musculoskeletal_ae.ros_tools.rejecting_nodes import Rejections
 from musculoskeletal_ae.ros_tools.ros_tool import (
@@ -93,10 +95,19 @@ class Replay(Node):
         self.length = (self._stop - self._start) / 1e9  # duration of the played part [s]
         self._before = (self._start - bag.start) / 1e9  # skipped time at the start of the bag [s]
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
+        # Publishers, and the functions that publish a message with them, by recorded topic.
         self._publisher: dict[str, Publisher] = {}
+        self._publish: dict[str, Callable[[bytes], None]] = {}
         for recorded, name in names.items():
-            kind, qos = bag.topics[recorded].type, LATCHED if recorded in latched else reliable
-            self._publisher[recorded] = self.create_publisher(message_class(kind), name, qos)
+            kind = message_class(bag.topics[recorded].type)
+            if recorded in latched:
+                values = LatchedPublisher(self, kind, name)
+                self._publisher[recorded] = values.publisher
+                self._publish[recorded] = values.publish
+            else:
+                publisher = self.create_publisher(kind, name, reliable)
+                self._publisher[recorded] = publisher
+                self._publish[recorded] = publisher.publish
         self._recorded_time = None
         if options.clock:
             self._recorded_time = self.create_publisher(Clock, '/clock', QoSProfile(depth=1))
@@ -179,7 +190,7 @@ class Replay(Node):
                 self._wait_for_nodes(message.log_time)
                 self._tick()
                 STOP.raise_if_received()
-                self._publisher[message.topic].publish(message.data)
+                self._publish[message.topic](message.data)
                 if self._lockstep is not None:
                     self._lockstep.count()
 

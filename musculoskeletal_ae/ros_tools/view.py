@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `view`: shows a running arm on a web page, and moves it on request.
 
-The node subscribes only while somebody views the page. Once for each picture, it then takes the
+The node subscribes when the first visitor opens the page. Once for each picture, it then takes the
 newest message of each topic, and all messages of /diagnostics. An executor would instead handle
-every message of every topic, which would take a tenth of a core.
+every message of every topic, which would take a tenth of a core. The subscriptions remain after the
+last visitor has left, because Fast DDS may crash if a subscription is destroyed while publishers of
+its topic come and go (`ros/latched_values.py`).
 
 The page shows the arm of the node's namespace. If the ROS graph has other arms, it lists them all,
 with links to their pages.
@@ -117,7 +119,7 @@ class View(Node):
         self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
         #: the newest value, and the arrival of its topic, by name
         self.newest: dict[str, tuple[Any, Arrival]] = {}
-        self.subscribed: list[Any] = []  # subscriptions, while somebody views the page
+        self.subscribed: list[Any] = []  # subscriptions, from the first visitor on
         #: monotonic time [s] of the last update of texts, check of the graph, and report
         self.texts_at = self.graph_at = self.reported_at = -math.inf
         self.faults: list[str] = []  # faults that the hardware emulator imitates
@@ -212,15 +214,13 @@ class View(Node):
                     self._do(what, *value)
                 except Exception as error:  # noqa: BLE001 - a page may send anything
                     self.page.notify(printable(f'{what}: {error}'), False)
-            if not is_viewed:
-                for subscription in self.subscribed:
-                    self.destroy_subscription(subscription)
-                self.subscribed, self.newest = [], {}
-                continue
-            if not self.subscribed:
+            if is_viewed and not self.subscribed:
                 self._subscribe()
             begun = time.monotonic()
             try:
+                self._take()
+                if not is_viewed:
+                    continue
                 self._show(begun)
             except Exception as error:  # noqa: BLE001 - topics and services may bring anything
                 if self.reception.reject_error('page', error):
@@ -229,7 +229,6 @@ class View(Node):
 
     def _show(self, now: float) -> None:
         """Show the newest messages; `now` is monotonic time [s]."""
-        self._take()
         self.arms.forget_ended()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
         if (measured := posture.get('measured')) is not None and np.isnan(measured).any():

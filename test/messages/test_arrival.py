@@ -80,12 +80,12 @@ def test_a_message_that_was_sent_no_later_than_the_last_one_is_not_new(sent, num
     assert arrival.receive(0.0, sent, number) == is_new
 
 
-def test_messages_of_several_publishers_and_of_a_new_subscription_are_all_new():
+def test_messages_of_several_publishers_and_after_forgotten_order_are_all_new():
     arrival = Arrival()
     assert arrival.receive(0.0, 100 * SECOND, 50)
     assert arrival.receive(0.0, 99 * SECOND + 1, 1, lambda: False)
     assert arrival.turns == 1
-    arrival.resubscribed()
+    arrival.forget_order()
     assert arrival.receive(0.0, 99 * SECOND + 1, 1)
 
 

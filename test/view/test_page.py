@@ -274,7 +274,6 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.screenshot(SCREENSHOTS / 'rupture.png')
     finally:
         page.close()
-    graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'the page to unsubscribe')
 
 
 @pytest.mark.parametrize('limits', [(0.001, 0.009), (-1.5, 2.0)])
