@@ -378,10 +378,13 @@ import_mujoco() {
 
 # --- The system ----------------------------------------------------------------------------------
 
-# Prints the value of a parameter: the last one of config/nodes.yaml, --params-file and -p.
-chosen_value() { # NAME
-  { cat "$repository/config/nodes.yaml" "${parameter_files[@]}" && printf '%s\n' "${parameters[@]}"; } |
-    sed -n -e "s/^[^#]*\b$1: \+\([A-Za-z0-9.]\+\).*/\1/p" -e "s/^[a-z_]*:$1:=//p" | tail -n 1
+# Prints the value that nodes get for a parameter; if their values differ, the largest one.
+chosen_value() { # NAME NODE…
+  local each
+  local -a chosen=()
+  for each in "${parameter_files[@]}"; do chosen+=(--params-file "$each"); done
+  for each in "${parameters[@]}"; do chosen+=(-p "$each"); done
+  "$python" -m musculoskeletal_ae.nodes.chosen_parameters "$@" "${common[@]}" "${chosen[@]}"
 }
 
 # Sets $kept to the parameters that choose a node's state directory. State of an emulated arm is saved
@@ -418,8 +421,10 @@ if [ -n "$bag" ] || [ $own_clock = true ]; then common+=(-p use_sim_time:=true);
 
 if [ $hardware = true ]; then
   # Start no node that could move the arm before the driver has passed the check.
-  check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)")
-  [[ ! $(chosen_value zero_at_start) =~ ^([Tt]rue|yes|on)$ ]] || check+=(--unzeroed)
+  rate=$(chosen_value rate estimator controller) || exit
+  zero_at_start=$(chosen_value zero_at_start estimator) || exit
+  check=(--robot "$robot" --wait --seconds 3 --rate "$rate")
+  [ "$zero_at_start" = false ] || check+=(--unzeroed)
   launch check_driver "${check[@]}" --ros-args "${under[@]}"
   wait_for check_driver || exit 1
 elif [ -z "$bag" ]; then
