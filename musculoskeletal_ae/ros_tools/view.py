@@ -19,7 +19,7 @@ import traceback
 from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -87,6 +87,15 @@ EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value  # modes in whi
 SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
 
 
+class Pending(NamedTuple):
+    """A service request without a response."""
+
+    since: float  # monotonic time at which it was sent [s]
+    future: Any
+    answered: Callable[[Any], None]  # called with the response
+    failed: Callable[[str], None]  # called with the reason if no response comes
+
+
 class View(Node):
     """Shows messages on the page, and passes requests of visitors to topics and services."""
 
@@ -124,8 +133,7 @@ class View(Node):
         self.texts_at = self.graph_at = self.reported_at = -math.inf
         self.faults: list[str] = []  # faults that the hardware emulator imitates
         self.payload = 0.0
-        #: service requests without a response: time sent [s], future, callback
-        self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []
+        self.pending: list[Pending] = []
         self.answers = SingleThreadedExecutor()
         self.answers.add_node(self)
         self.clients_of = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
@@ -188,11 +196,13 @@ class View(Node):
             self.answers.spin_once(timeout_sec=0.0)
         waiting, self.pending = self.pending, []
         # Call the callbacks here, because an executor would call them one request late.
-        for since, future, answered in waiting:
-            if future.done():
-                answered(future.result())
-            elif time.monotonic() - since < PATIENCE:  # otherwise assume that the node has ended
-                self.pending.append((since, future, answered))
+        for each in waiting:
+            if each.future.done():
+                each.answered(each.future.result())
+            elif time.monotonic() - each.since < PATIENCE:
+                self.pending.append(each)
+            else:
+                each.failed(f'no answer for {PATIENCE:g} s; the node may hang or have ended')
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -313,7 +323,9 @@ class View(Node):
             running.add('pushed')
         self.page.offer(running, self._newest('mode', math.inf) in EXPLORING)
         self.page.list_arms(self.arms.summaries(), self.get_namespace())
-        self._ask(GET, self._on_emulator_state, quiet=True, names=['faults', 'payload'])
+        # No visitor has asked for this, so that it fails is not shown.
+        names, no_note = ['faults', 'payload'], lambda _: None
+        self._ask(GET, self._on_emulator_state, quiet=True, failed=no_note, names=names)
 
     def _on_emulator_state(self, answer: Any) -> None:
         match [parameter_value_to_python(value) for value in answer.values]:
@@ -331,16 +343,21 @@ class View(Node):
         name: str,
         then: Callable[[Any], object] | None = None,
         quiet: bool = False,
+        failed: Callable[[str], None] | None = None,
         **fields: Any,
     ) -> None:
-        """Call a service if it is available.
+        """Call a service, and tell the visitors if it is not available or does not answer.
 
         Args:
             name: Name of the service.
             then: Called with the response.
             quiet: Whether to hide the response from the visitors.
+            failed: Called with the reason if there is no response, instead of telling the visitors.
             fields: Fields of the request.
         """
+
+        def tell_failure(reason: str) -> None:
+            self.page.notify(f'{name}: {reason}', False)
 
         def answered(answer: Any) -> None:
             if not quiet:
@@ -355,7 +372,12 @@ class View(Node):
 
         if self.clients_of[name].service_is_ready():
             future = self.clients_of[name].call_async(SERVICES[name].Request(**fields))
-            self.pending.append((time.monotonic(), future, answered))
+            now = time.monotonic()
+            self.pending.append(Pending(now, future, answered, failed or tell_failure))
+        else:
+            (failed or tell_failure)(
+                f'no running node has this service; start {name.split("/")[0]}'
+            )
 
     def _do(self, what: str, value: Any = None) -> None:
         """Carry out a request of a visitor.

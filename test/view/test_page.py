@@ -5,22 +5,27 @@ import gzip
 import itertools
 import math
 import socket
+from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from types import SimpleNamespace
 from typing import Any
 from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from graph import Process, executable, no_number_of, seldom
+from graph import DEADLINE, Process, executable, no_number_of, seldom
 from nodes.test_bringup_status import diagnostics
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.conditions import stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -35,6 +40,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros_tools import view as ros_view
+from musculoskeletal_ae.ros_tools.ros_tool import start_ros
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.view import controls
 from musculoskeletal_ae.view.controls import REST_TIME
@@ -178,6 +185,38 @@ def test_notifications_name_the_buttons_of_the_page(arm26, monkeypatch, read_onl
         page.close()
     call = 'call estimator/reset' if read_only else f'press "{controls.RESET}"'
     assert notified == ['refused', f'it has jumped; then {call} again']
+
+
+@pytest.mark.parametrize('request_name', ['controller/stop', 'reset'])
+def test_a_request_that_no_node_answers_is_reported(graph, arm26, monkeypatch, request_name):
+    notes = SimpleQueue()
+    visitor = SimpleNamespace(add_notification=lambda *texts, **_: notes.put(texts))
+    monkeypatch.setattr(viser.ViserServer, 'get_clients', lambda _: {0: visitor})
+    monkeypatch.setattr(ros_view, 'PATIENCE', 0.5)
+    start_ros(['view', '--ros-args', '-r', f'__ns:={graph.namespace}'])
+    node = ros_view.View(arm26, Namespace(host='127.0.0.1', port=free_port(), read_only=True))
+    thread = Thread(target=node.run)
+    thread.start()
+    try:
+        node.requests.put((request_name,))
+        assert notes.get(timeout=DEADLINE) == ('refused', notes_of_missing(request_name))
+        # The service exists, but its node hangs: it does not run while the test waits.
+        service = 'estimator/reset' if request_name == 'reset' else request_name
+        graph.node.create_service(Trigger, service, lambda _, response: response)
+        note = ''
+        while 'no answer' not in note:  # until the page has discovered the service
+            node.requests.put((request_name,))
+            note = notes.get(timeout=DEADLINE)[1]
+        assert note.startswith(f'{service}: no answer for 0.5 s')
+    finally:
+        rclpy.shutdown()
+        thread.join()
+        node.page.close()
+
+
+def notes_of_missing(request_name):
+    service = 'controller/reset' if request_name == 'reset' else request_name
+    return f'{service}: no running node has this service; start controller'
 
 
 def test_the_tab_of_the_browser_names_the_arm(arm26):
