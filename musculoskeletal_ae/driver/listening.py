@@ -189,7 +189,7 @@ class Listening:
         has_angles = not self._stated and not np.isnan(self._theta).all()
         for (topic, reason), errors in self._rejected.items():
             detail = f'{topic}: {len(errors)} messages rejected, {errors[-1]}'
-            # Another driver, such as that of a hand, may publish its own joints on this topic.
+            # The driver may publish other joints, such as those of a hand, in other messages.
             if reason == 'missing joint' and has_angles:
                 verdict.notes.append(detail)
             else:

@@ -26,6 +26,7 @@ from musculoskeletal_ae.messages.arrival import SILENCE, Arrival
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.process_signals import import_heavy
 from musculoskeletal_ae.ros.message_building import RELIABLE, SENSOR, array_message, motor_command
+from musculoskeletal_ae.ros.second_publishers import LOOK_PERIOD, Authorship, publishers_of
 from musculoskeletal_ae.ros_tools.ros_tool import (
     ROS_HELP,
     Spinner,
@@ -79,18 +80,42 @@ class CheckDriver:
         command = self.motors.command_topic or 'muscle_length_command'
         resolve = self.node.resolve_topic_name
         self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
+        self.joint_topic = resolve(JOINTS)
+        #: order of the messages of each topic, and whether they come from a single node
+        self.arrivals = {topic: Arrival() for topic in (self.topic, self.joint_topic)}
+        self.authorships = {topic: Authorship() for topic in self.arrivals}
         self.muscles: Callable[[Any, dict[str, int]], object] = lambda *_: None
         self.joints: Callable[[JointState], object] = lambda _: None
         self.measured: Callable[[], Any] = lambda: None  # returns the newest θ of the joint sensors
         subscribe: Any = self.node.create_subscription
         kind = message_class(self.motors.state_type)
-        subscribe(kind, self.topic, lambda m, info: self.muscles(m, info), SENSOR)
-        subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
+
+        def take_muscles(message: Any, info: dict[str, int]) -> None:
+            self._note_order(self.topic, info)
+            self.muscles(message, info)
+
+        def take_joints(message: JointState, info: dict[str, int]) -> None:
+            self._note_order(self.joint_topic, info)
+            self.joints(message)
+
+        subscribe(kind, self.topic, take_muscles, SENSOR)
+        subscribe(JointState, JOINTS, take_joints, SENSOR)
         self.awake = AwakeClock(LONGEST_TICK)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.node.create_timer(TICK, lambda: self.awake.tick(time.monotonic()), clock=clock)
+        self.node.create_timer(LOOK_PERIOD, self._look, clock=clock)
         self.spin_until = Spinner(self.node).spin_until
         self.spin_until(lambda: False, DISCOVERY_TIME)
+
+    def _note_order(self, topic: str, info: dict[str, int]) -> None:
+        sent, number = info['source_timestamp'], info['publication_sequence_number']
+        self.arrivals[topic].receive(time.monotonic(), sent, number)
+
+    def _look(self) -> None:
+        """Look for second publishers on the graph."""
+        for topic, authorship in self.authorships.items():
+            publishers = publishers_of(self.node, topic)
+            authorship.look(publishers, self.arrivals[topic].turns, time.monotonic())
 
     def _mistyped(self) -> str:
         kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(self.topic)}
@@ -134,7 +159,7 @@ class CheckDriver:
                 text = f'listening for {chosen.seconds:g} s'
                 # Give an instruction only if there is time to follow it.
                 if chosen.move or chosen.seconds >= COUNTDOWN:
-                    has_joint_sensors = node.count_publishers(JOINTS) > 0
+                    has_joint_sensors = node.count_publishers(self.joint_topic) > 0
                     text += f': {_instruction(self.robot, chosen, has_joint_sensors)}'
                 _say(text)
             self._listen_for(chosen.seconds)
@@ -142,9 +167,12 @@ class CheckDriver:
         if wrong := self._mistyped():
             expected = self.motors.state_type
             verdict.failed('type', topic=self.topic, type=wrong, expected=expected)
-        elif (publishers := node.count_publishers(self.topic)) > 1:
-            verdict.failed('several', n=publishers, topic=self.topic)
-        if not node.count_publishers(JOINTS):
+        elif nodes := self.authorships[self.topic].intruders:
+            verdict.failed('several', nodes=nodes, topic=self.topic)
+        nodes = self.authorships[self.joint_topic].intruders
+        if nodes and self.joint_topic != self.topic:
+            verdict.failed('several of joints', nodes=nodes, topic=self.joint_topic)
+        if not node.count_publishers(self.joint_topic):
             verdict.notes.append(
                 'joint_states has no publisher; the learner needs it, unless its parameter '
                 '`joint_source` is `marker` or `none`'

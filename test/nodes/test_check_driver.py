@@ -8,6 +8,8 @@ from io import StringIO
 
 import pytest
 from graph import PATIENCE
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
@@ -144,6 +146,42 @@ def test_check_driver_stops_moving_when_a_controller_starts(graph, capsys):
     graph.node.create_subscription(Float64MultiArray, topic, start_controller, 10)
     assert check_here(graph, '--wait', '--seconds', '1', '--move') == 1
     assert controller and 'stop the controller' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('topic', ['muscle_states', 'joint_states'])
+def test_a_second_node_on_a_topic_of_the_driver_is_a_fault(graph, capsys, topic):
+    start_driver(graph)
+    kinds = {'muscle_states': Float64MultiArray, 'joint_states': JointState}
+    graph.node.create_publisher(kinds[topic], topic, 10)
+    assert check_here(graph, '--seconds', '1.5') == 1
+    output = capsys.readouterr().out
+    nodes = f'{graph.namespace}/hardware_emulator and {graph.namespace}/test'
+    assert f'{graph.namespace}/{topic} come from {nodes}' in output
+    assert ('source_list' in output) == (topic == 'joint_states')
+
+
+def test_two_publishers_of_one_node_name_are_no_fault_unless_their_messages_interleave(
+    graph, capsys
+):
+    """A killed driver stays in the graph for up to 20 s beside its successor."""
+    start_driver(graph)
+    killed = Node('hardware_emulator', context=graph.context, namespace=graph.namespace)
+    killed.create_publisher(Float64MultiArray, 'muscle_states', 10)
+    check_here(graph, '--seconds', '1.5')
+    assert 'come from' not in capsys.readouterr().out
+    killed.destroy_node()
+
+
+def test_remapped_joint_states_are_found(graph, capsys):
+    start_driver(graph)
+    remap = ['--ros-args', '-r', f'__ns:={graph.namespace}', '-r', 'joint_states:=other']
+    with graph.spinning():
+        check_driver.main([*COMMON, '--seconds', '0.5', *remap])
+    assert 'joint_states has no publisher' in capsys.readouterr().out
+    graph.node.create_publisher(JointState, 'other', 10)
+    with graph.spinning():
+        check_driver.main([*COMMON, '--seconds', '0.5', *remap])
+    assert 'joint_states has no publisher' not in capsys.readouterr().out
 
 
 def test_nodes_report_the_topics_that_they_wait_for(graph, capfd):
