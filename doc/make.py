@@ -123,10 +123,11 @@ Nodes take no options of their own, only `--ros-args`: see [Parameters](paramete
 `view` also take `--ros-args` after their own options, such as `--ros-args -r __ns:=/left_arm -r
 TOPIC:=OTHER`. `-h` prints the help.
 
-On Ctrl-C (SIGINT) and SIGTERM, a node ends with exit status 0. `record` and `replay` also end with
-0, because this is the usual way to end them. Any other tool ends with 130 and prints one line,
-which states whether its result was written. In this case, `train --from-bag` saves what it has
-learned to `NAME.interrupted.safetensors` beside the file of `--out`."""
+On Ctrl-C (SIGINT), SIGTERM and SIGHUP (closed terminal), a node ends with exit status 0. `record`
+and `replay` also end with 0, because this is the usual way to end them. Any other tool ends with
+130 and prints one line, which states whether its result was written. In this case,
+`train --from-bag` saves what it has learned to `NAME.interrupted.safetensors` beside the file of
+`--out`."""
 
 #: parts of every --help that the page states once
 REPEATED = (

@@ -2,9 +2,9 @@
 """The executables, one function each; setup.py lists them as console scripts.
 
 This module imports nothing heavy. Hence `--help` answers quickly, and signals are handled before
-torch and rclpy are loaded. On Ctrl-C or SIGTERM, nodes exit with status 0 and tools with 130.
-`record` and `replay` exit with 0, because Ctrl-C is how a user normally ends them. An interrupted
-tool prints what it has written. No executable prints a traceback.
+torch and rclpy are loaded. On Ctrl-C, SIGTERM or SIGHUP, nodes exit with status 0 and tools with
+130. `record` and `replay` exit with 0, because Ctrl-C is how a user normally ends them. An
+interrupted tool prints what it has written. No executable prints a traceback.
 """
 
 import ast

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reactions of a process to SIGINT (Ctrl-C) and SIGTERM.
+"""Reactions of a process to SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed).
+
+SIGHUP remains ignored if it is when the process starts, as under `nohup`.
 
 rclpy's own signal handlers are not installed (`SignalHandlerOptions.NO`), because they shut the ROS
 context down from a native thread at any moment. A node under construction then fails with "context
@@ -16,14 +18,14 @@ from enum import Enum, auto
 from importlib import import_module
 from types import ModuleType
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INTERRUPTED = 130  # exit status of an interrupted tool
 #: under `Reaction.EXIT_SOON`, end the process at the latest this long after the signal [s]
 GRACE = 2
 
 
 class Reaction(Enum):
-    """Reaction of a process to a stop signal (SIGINT or SIGTERM)."""
+    """Reaction of a process to a stop signal."""
 
     #: End the process at once. Used during imports, because extension modules turn a
     #: KeyboardInterrupt during their initialisation into other errors.
@@ -39,7 +41,7 @@ class Reaction(Enum):
 
 
 class StopSignals:
-    """Handles SIGINT and SIGTERM; the only instance, `STOP`, serves the whole process."""
+    """Handles the stop signals; the only instance, `STOP`, serves the whole process."""
 
     def __init__(self) -> None:
         self.received = False
@@ -55,7 +57,8 @@ class StopSignals:
         """
         self.received, self._reaction, self._exit_status = False, reaction, exit_status
         for number in STOP_SIGNALS:
-            signal.signal(number, self._on_signal)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self._on_signal)
         signal.signal(signal.SIGALRM, lambda *_: os._exit(exit_status))
 
     def ignore(self) -> None:
@@ -94,17 +97,19 @@ STOP = StopSignals()
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT within a `with` block, and in child processes that are started there.
+    """Block SIGINT and SIGHUP within a `with` block, and in child processes that start there.
 
-    Ctrl-C sends SIGINT to the whole process group, but only the parent may end its children.
+    Ctrl-C sends SIGINT to the whole process group, and closing the terminal sends SIGHUP, but only
+    the parent may end its children.
     """
     from multiprocessing import resource_tracker
 
-    # The resource tracker unblocks SIGINT when it starts. Start it before SIGINT is blocked,
-    # because the first child would otherwise start it afterwards.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
+        # The resource tracker unblocks SIGINT when it starts. Start it before SIGINT is blocked,
+        # because the first child would otherwise start it afterwards.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
