@@ -417,7 +417,9 @@ under=(--disable-external-lib-logs)
 common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
   -p "robot:=$(quoted "$robot")" -p "preset:=$preset" -p "seed:=$seed"
   -p "checkpoint:=$(quoted "$checkpoint")")
-if [ -n "$bag" ] || [ $own_clock = true ]; then common+=(-p use_sim_time:=true); fi
+sim_time=() # for the recorder as well, so that its times agree with the stamps of the nodes
+if [ -n "$bag" ] || [ $own_clock = true ]; then sim_time=(-p use_sim_time:=true); fi
+common+=("${sim_time[@]}")
 
 if [ $hardware = true ]; then
   # Start no node that could move the arm before the driver has passed the check.
@@ -443,7 +445,7 @@ if [ $learner = true ]; then
   kept_in learner
   start_node learner "${kept[@]}" -p "joint_source:=$joint_source"
 fi
-[ -z "$record" ] || start record -o "$record" --robot "$robot" --ros-args "${under[@]}"
+[ -z "$record" ] || start record -o "$record" --robot "$robot" --ros-args "${under[@]}" "${sim_time[@]}"
 if [ -n "$bag" ]; then
   # A recording contains time and commands, so no controller is started. These nodes receive every
   # message, however slow this computer is.

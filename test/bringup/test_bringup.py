@@ -21,6 +21,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.ros.message_building import LATCHED
@@ -173,12 +174,17 @@ def test_a_mujoco_model_is_imported_trained_once_estimated_and_recorded(bringup,
     assert left_behind(run) == ''
 
     robot = import_robot(file, tmp_path / 'own').robot.description.directory
-    played = bringup(*chosen, '--robot', str(robot), '--bag', str(recording))
+    again = tmp_path / 'again'
+    played = bringup(
+        *chosen, '--robot', str(robot), '--bag', str(recording), '--record', str(again)
+    )
     _, output = played.ended()
     assert played.process.returncode == 0 and 'from an earlier run' in output, output
     assert statuses(output), output  # on a busy machine, the replay may end after the first line
     assert 'hardware_emulator' not in output and 'controller' not in output
     assert left_behind(played) == ''
+    # The times of a recording made during a replay are those of the replayed one.
+    assert Bag.open(again).start < Bag.open(recording).end
 
 
 def test_of_two_arms_one_learns_and_the_other_detects_a_rupture_and_names_a_dead_node(
