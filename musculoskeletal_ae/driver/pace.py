@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure the rate at which a driver publishes.
 
-Source time and sequence number of the messages give the rate of publication. Without them, the rate
-of reception is used, which may be lower: a busy computer may delay or lose messages, or block this
-process. The `AwakeClock` of this process shows whether it was blocked.
+Source time and sequence number of the messages give the rate of publication. Without them, or if
+the driver's clock was set, the rate of reception is used, which may be lower: a busy computer may
+delay or lose messages, or block this process. The `AwakeClock` of this process shows whether it was
+blocked.
 
 A driver must keep at least the expected rate. If it does not, but this computer is overloaded, the
 rate is not judged, because the driver may run here. The motion test then remains possible if the
@@ -28,6 +29,11 @@ LEAST_RATE = 30.0
 #: overloaded [s]
 LONGEST_STALL = 1.0
 LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
+
+
+#: conclude that the driver's clock was set forward if a message seems to come faster than all
+#: before it by more than this [s]; the first messages may be slower by less than this
+CLOCK_STEP = 0.1
 
 
 class _Received(NamedTuple):
@@ -58,9 +64,8 @@ class Pace:
     def judge(self, verdict: Verdict, now: float) -> None:
         """Judge the rate and the gaps until `now` [s], and add the results to `verdict`."""
         came, came_awake, sent, number = map(np.array, zip(*self._messages))
-        is_dated = bool(np.isfinite(sent).all() and (np.diff(sent) >= 0.0).all())
-        is_numbered = is_dated and bool((number > 0).all() and (np.diff(number) > 0).all())
-        times = sent if is_dated else came
+        is_numbered = bool((number > 0).all() and (np.diff(number) > 0).all())
+        times = sent if _is_steady(sent, came) else came
         gaps = np.diff(times)
         steps = np.diff(number) if is_numbered else np.ones(len(gaps))
         lost = int(steps.sum() - len(gaps))
@@ -108,6 +113,22 @@ class Pace:
             verdict.forbid_motion(
                 f'readings came at {rate:.0f} Hz, but the motion test needs {LEAST_RATE:g} Hz'
             )
+
+
+def _is_steady(sent: Array, came: Array) -> bool:
+    """Return whether the driver's clock is known, and was not set while it sent these messages.
+
+    Args:
+        sent: Times of sending by the driver's clock [s]; NaN if unknown.
+        came: Times of reception [s].
+    """
+    if not np.isfinite(sent).all() or (np.diff(sent) < 0.0).any():
+        return False
+    # A delay makes a message slower than others. Only a step of the clock makes all later messages
+    # seem faster than every message before.
+    offset = came - sent
+    fastest = np.minimum.accumulate(offset)
+    return bool((fastest[:-1] - offset[1:] < CLOCK_STEP).all())
 
 
 def _explained(came: Array, came_awake: Array) -> bool:

@@ -688,6 +688,17 @@ def test_messages_that_are_lost_on_the_way_are_no_fault_of_the_driver():
     assert '80 of 300 messages were lost in transit' in str(verdict)
 
 
+@pytest.mark.parametrize('step', [-3600.0, 0.3, 3600.0])
+@pytest.mark.parametrize('lost', [(), range(100, 140)])
+def test_a_clock_of_the_driver_that_is_set_is_no_gap(step, lost):
+    messages = Messages()
+    messages.bring(
+        300, lambda n: 5000.0 + 0.01 * n + (step if n >= 150 else 0.0), lambda n: 0.01 * n, lost
+    )
+    verdict = messages.listening.verdict(3.0)
+    assert not verdict.faults, str(verdict)
+
+
 @pytest.mark.parametrize('is_busy', [True, False])
 def test_a_gap_in_which_this_computer_was_blocked_is_recognised(is_busy):
     messages = Messages()
