@@ -96,7 +96,11 @@ class Page:
         server.on_client_connect(self._on_connect)
         server.on_client_disconnect(self._on_disconnect)
 
-    def _on_connect(self, client: viser.ClientHandle) -> None:
+    # viser runs asynchronous callbacks in its event loop, one after the other and in the order of
+    # the events. It would run others in a pool of threads, in any order: a visitor who leaves at
+    # once could then be counted for ever. The order requires that the callbacks await nothing.
+
+    async def _on_connect(self, client: viser.ClientHandle) -> None:
         camera = client.camera
         is_narrow = camera.image_width < NARROW
         window = camera.image_width, camera.image_height
@@ -106,7 +110,7 @@ class Page:
         self._readings[client.client_id] = ReadingsPanel(client.gui, self._robot, is_narrow)
         self.looked_at.set()
 
-    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+    async def _on_disconnect(self, client: viser.ClientHandle) -> None:
         self._readings.pop(client.client_id, None)
         if self.controls is not None:
             self.controls.end_visit()

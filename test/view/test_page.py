@@ -550,26 +550,49 @@ def test_a_stop_or_departure_discards_a_target_that_is_being_entered(entering, c
     if is_stop:
         page.controls.request('controller/stop')
     else:
-        page._on_disconnect(SimpleNamespace(client_id=-1))
+        page.controls.end_visit()
     clock.now += SETTLE_TIME
     page.send_entries()
     assert asked == [('controller/stop',)] * is_stop
 
 
-def test_a_push_ends_when_its_visitor_leaves(arm26):
-    asked = []
-    page = Page(arm26, '127.0.0.1', free_port(), False, lambda *what: asked.append(what))
+def enter_page(port):
+    """Return the connection of a new visitor."""
+    connection = visit(port, f'http://localhost:{port}')
+    connection.send(msgspec.msgpack.encode({'type': 'ViewerCameraMessage', **CAMERA}))
+    return connection
+
+
+def test_a_push_ends_when_its_visitor_leaves(arm26, graph):
+    port, asked = free_port(), []
+    page = Page(arm26, '127.0.0.1', port, False, lambda *what: asked.append(what))
     try:
-        visitor = SimpleNamespace(client_id=1)
-        page._on_disconnect(visitor)
-        assert asked == []
-        ends = {'start_position': np.zeros(3), 'end_position': np.ones(3)}
-        assert page.controls.push(SimpleNamespace(phase='update', **ends)).any()
-        page._on_disconnect(visitor)
+        with enter_page(port):
+            graph.wait(page.looked_at.is_set, 'the visitor to be counted')
+            ends = {'start_position': np.zeros(3), 'end_position': np.ones(3)}
+            assert page.controls.push(SimpleNamespace(phase='update', **ends)).any()
+            assert asked == []
+        graph.wait(lambda: asked, 'the end of the push')
     finally:
         page.close()
     ((what, force),) = asked
     assert what == 'push' and not force.any()
+
+
+def test_visitors_who_come_and_go_at_once_are_not_counted_for_ever(arm26, graph):
+    port = free_port()
+    page = Page(arm26, '127.0.0.1', port, True, lambda *_: None)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            for _ in pool.map(lambda _: enter_page(port).close(), range(100)):
+                pass
+        with enter_page(port):
+            graph.wait(page.looked_at.is_set, 'the last visitor to be counted')
+        graph.wait(lambda: not page.looked_at.is_set(), 'all visitors to leave')
+        with enter_page(port):
+            graph.wait(page.looked_at.is_set, 'a new visitor to be counted')
+    finally:
+        page.close()
 
 
 def test_an_address_that_cannot_be_used_is_refused(arm26):
