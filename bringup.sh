@@ -198,6 +198,8 @@ robot_directory=$repository/config/$robot
 
 # --- environment ---------------------------------------------------------------------------------
 
+trap 'exit 130' INT
+
 # shellcheck source=.ci/environment.sh
 . "$repository/.ci/environment.sh"
 package=$repository/musculoskeletal_ae
@@ -207,7 +209,7 @@ if [ $is_installed = true ]; then
   executables=$here
   package=$("$python" -c 'import musculoskeletal_ae; print(musculoskeletal_ae.__path__[0])') ||
     fail 'Source the workspace in which musculoskeletal_ae is installed, and its virtual environment.'
-  log_folder=${ROS_LOG_DIR:-${ROS_HOME:-$HOME/.ros}/log}
+  log_folder=${ROS_LOG_DIR:-${ROS_HOME:-~/.ros}/log} # ~ is known without HOME, too
   mkdir -p "$log_folder" || exit 1
   setup_log=$log_folder/setup.log
   if [ -w "$package" ]; then # otherwise each node compiles into the cache of its user
@@ -226,10 +228,15 @@ if [ $hardware = false ] && [ $network = false ]; then
 fi
 # shellcheck source=.ci/udp.sh
 . "$repository/.ci/udp.sh"
-[ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.declared_parameters "${parameters[@]}" || exit
+
+run_module() { # MODULE ARGUMENT…   Runs `main` of a module of the package; on Ctrl-C it ends silently.
+  "$python" -m musculoskeletal_ae.executables "$@"
+}
+
+[ ${#parameters[@]} = 0 ] || run_module nodes.declared_parameters "${parameters[@]}" || exit
 if [ -n "$bag" ]; then
   say "reading $bag"
-  "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" "${from[@]}" || exit 2
+  run_module tools.recorded_robot "$bag" "$robot" "${from[@]}" || exit 2
 fi
 
 # A namespace contains one arm. The lock is held until the last process has ended, which takes a
@@ -331,7 +338,6 @@ stop() {
     -e 's/^warning: /-- record: &/p' "$logs/record.log"
 } 2>/dev/null # without bash's own messages about killed processes
 trap stop EXIT
-trap 'exit 130' INT
 trap 'exit 143' TERM
 trap 'exit 129' HUP
 
@@ -340,7 +346,7 @@ trap 'exit 129' HUP
 # Sets $checkpoint to a file in the cache of initial networks, which `train --from-bag` shares.
 train_once() {
   local training
-  checkpoint=$("$python" -m musculoskeletal_ae.tools.network_cache "$robot" "$preset" ${quick[@]:+quick}) || exit 1
+  checkpoint=$(run_module tools.network_cache "$robot" "$preset" ${quick[@]:+quick}) || exit 1
   # Of several bringup.sh that start at the same time, only one trains.
   exec {training}>>"$checkpoint.lock" || exit 1
   if ! flock -n "$training"; then
@@ -384,7 +390,7 @@ chosen_value() { # NAME NODE…
   local -a chosen=()
   for each in "${parameter_files[@]}"; do chosen+=(--params-file "$each"); done
   for each in "${parameters[@]}"; do chosen+=(-p "$each"); done
-  "$python" -m musculoskeletal_ae.nodes.chosen_parameters "$@" "${common[@]}" "${chosen[@]}"
+  run_module nodes.chosen_parameters "$@" "${common[@]}" "${chosen[@]}"
 }
 
 # Sets $kept to the parameters that choose a node's state directory. State of an emulated arm is saved

@@ -7,12 +7,13 @@
 # to `ros2 run`. $bin is their folder, for terminals without the command `ros2`. If no ROS is
 # sourced, the terminal sees only arms on this machine, unless ROS_AUTOMATIC_DISCOVERY_RANGE is set.
 # Its nodes exchange messages over UDP, as those of bringup.sh (.ci/udp.sh).
+# With CDPATH, cd might enter another directory, and print it.
 if (
-  repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
+  repository=$(CDPATH='' cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
   . "$repository/.ci/environment.sh"
   environment_setup
 ); then
-  bin=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P)
+  bin=$(CDPATH='' cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P)
   if [ -z "${ROS_DISTRO-}" ]; then
     export AMENT_PREFIX_PATH=$bin/.venv
     export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}

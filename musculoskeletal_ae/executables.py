@@ -110,3 +110,20 @@ export_mjcf = partial(_run_tool, 'tools.export_mjcf')
 fit_series_elastic = partial(_run_tool, 'tools.fit_series_elastic')
 import_robot = partial(_run_tool, 'tools.import_robot')
 train = partial(_run_tool, 'tools.train')
+
+
+def _help_bringup(module: str, arguments: list[str]) -> int:
+    """Run the function `main` of a module for bringup.sh; return the exit status.
+
+    On Ctrl-C, the process ends at once and silently.
+    """
+    _prepare_process()
+    STOP.install(Reaction.EXIT)
+    try:
+        return int(import_module(f'musculoskeletal_ae.{module}').main(arguments))
+    finally:
+        STOP.ignore()
+
+
+if __name__ == '__main__':  # python -m musculoskeletal_ae.executables MODULE ARGUMENT…
+    sys.exit(_help_bringup(sys.argv[1], sys.argv[2:]))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prints the value that nodes get for a parameter, for bringup.sh.
 
-Usage: python -m musculoskeletal_ae.nodes.chosen_parameters NAME NODE… --ros-args …
+Usage: python -m musculoskeletal_ae.executables nodes.chosen_parameters NAME NODE… --ros-args …
 
 ROS itself reads parameter files and `-p`: this module starts nodes with the same names, and prints
 the largest of their values. The nodes discover no others and end at once.
@@ -70,7 +70,3 @@ def main(arguments: Sequence[str]) -> int:
     finally:
         rclpy.try_shutdown()
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))

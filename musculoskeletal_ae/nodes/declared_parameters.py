@@ -253,7 +253,3 @@ def main(assignments: Sequence[str]) -> int:
             print(f'-p {assignment!r}: {error}', file=sys.stderr)
             return 2
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))

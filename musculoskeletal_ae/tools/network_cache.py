@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cache of initial networks, which `bringup.sh` and `train --from-bag` share.
 
-    python -m musculoskeletal_ae.tools.network_cache ROBOT PRESET [quick]
+    python -m musculoskeletal_ae.executables tools.network_cache ROBOT PRESET [quick]
 
 prints the file of an initial network for bringup.sh, and creates its directory. With `quick`, the
 file is that of a shortened training, unless a network with the complete training exists.
@@ -93,7 +93,3 @@ def main(arguments: list[str]) -> int:
         return 1
     print(file)
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tells whether a recording is one of a given robot, and if not, of which robot it is.
 
-    python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT [NAMESPACE]
+    python -m musculoskeletal_ae.executables tools.recorded_robot BAG ROBOT [NAMESPACE]
 
 ends with status 1 and one line if the nodes of the robot could not use the recording. `bringup.sh`
 calls it before it starts anything. It only reads the beginning of a recording that fits;
@@ -78,7 +78,3 @@ def main(arguments: list[str]) -> int:
     if problem:
         print(f'error: {printable(problem)}', file=sys.stderr)
     return 1 if problem else 0
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))

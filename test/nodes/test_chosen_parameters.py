@@ -13,7 +13,8 @@ ZERO = ['zero_at_start', 'estimator']
 
 
 def chosen(wanted, *arguments):
-    command = [sys.executable, '-m', 'musculoskeletal_ae.nodes.chosen_parameters', *wanted]
+    module = ['-m', 'musculoskeletal_ae.executables', 'nodes.chosen_parameters']
+    command = [sys.executable, *module, *wanted]
     return subprocess.run(
         [*command, *COMMON, *arguments], capture_output=True, text=True, timeout=300, check=False
     )
