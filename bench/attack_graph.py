@@ -587,6 +587,7 @@ LATCHING = (
     'body_state',
     'joint_sensor_trust',
     'rejected_checkpoint',
+    'publish_again',
 )
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}
 

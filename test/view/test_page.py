@@ -29,6 +29,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.conditions import stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.process_signals import STOP
 from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.ros.message_building import LATCHED
 
@@ -209,8 +210,9 @@ def test_a_request_that_no_node_answers_is_reported(graph, arm26, monkeypatch, r
             note = notes.get(timeout=DEADLINE)[1]
         assert note.startswith(f'{service}: no answer for 0.5 s')
     finally:
-        rclpy.shutdown()
+        monkeypatch.setattr(STOP, 'received', True)
         thread.join()
+        rclpy.shutdown()
         node.page.close()
 
 
