@@ -181,7 +181,7 @@ def not_finite(message):
 
 SOUND = states(lambda _: None)
 STATES = {
-    'not finite': (states(not_finite), 'publish finite values only', [SOUND]),
+    'not finite': (states(not_finite), 'publish finite lengths and tensions', [SOUND]),
     'wrong length': (lambda rows, _: array(rows[:2]), '3×M values', [SOUND]),
     'empty': (edited(data=np.zeros(0)), '3×M values', [SOUND]),
     'oversized': (edited(data=np.zeros(10_001)), '3×M values', [SOUND]),
