@@ -198,8 +198,6 @@ robot_directory=$repository/config/$robot
 
 # --- environment ---------------------------------------------------------------------------------
 
-trap 'exit 130' INT
-
 # shellcheck source=.ci/environment.sh
 . "$repository/.ci/environment.sh"
 package=$repository/musculoskeletal_ae
@@ -220,6 +218,7 @@ if [ $is_installed = true ]; then
 else
   environment_setup
 fi
+trap 'exit 130' INT # after environment_setup, which resets it
 
 # Keep an emulated arm off the network. A driver may run on another machine.
 if [ $hardware = false ] && [ $network = false ]; then
