@@ -275,6 +275,5 @@ def _keep(file: Path, previous: Path, temporary: Path) -> None:
             with temporary.open('rb') as copy:
                 os.fsync(copy.fileno())
         temporary.replace(previous)
-    finally:
-        if temporary.exists():  # `replace` leaves it if both were links to one file already
-            temporary.unlink()
+    finally:  # `replace` leaves it if both names were links to one file already
+        temporary.unlink(missing_ok=True)

@@ -196,11 +196,11 @@ def test_a_file_is_replaced_whole_and_the_one_before_it_kept(tmp_path):
 def test_a_writer_that_is_killed_leaves_the_file(has_links, tmp_path, monkeypatch):
     file, previous = tmp_path / 'a', tmp_path / 'before'
     files.write_whole(file, b'0', previous)
-    replace, seen = Path.replace, []
+    replace, states = Path.replace, []
 
     def record(self, target):
         done = replace(self, target)
-        seen.append((file.read_bytes(), previous.exists() and previous.read_bytes()))
+        states.append((file.read_bytes(), previous.exists() and previous.read_bytes()))
         return done
 
     def refuse_link(*_):
@@ -210,7 +210,7 @@ def test_a_writer_that_is_killed_leaves_the_file(has_links, tmp_path, monkeypatc
     if not has_links:
         monkeypatch.setattr(os, 'link', refuse_link)
     files.write_whole(file, b'1', previous)
-    assert seen == [(b'0', b'0'), (b'1', b'0')]
+    assert states == [(b'0', b'0'), (b'1', b'0')]
     monkeypatch.undo()
     previous.unlink()
     previous.hardlink_to(file)  # as a kill between the two steps leaves them

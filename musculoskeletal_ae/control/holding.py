@@ -59,12 +59,10 @@ class HoldingCheck:
 
         Without one of them, there is no distance, and the arm is not away from its target.
         """
-        is_same = target is self._target or (
-            target is not None and self._target is not None and (target == self._target).all()
-        )
-        self._target = target
+        before, self._target = self._target, target
         self.distance = None if target is None or theta is None else target - theta
-        if not is_same or self.distance is None:
+        is_new = target is None or before is None or not np.array_equal(target, before)
+        if is_new or self.distance is None:
             self._least = math.inf
         if self.distance is not None:
             self._least = min(self._least, self.largest)

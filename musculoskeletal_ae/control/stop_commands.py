@@ -102,23 +102,23 @@ class SafeStop:
         )
         value = np.minimum(last.value + change, np.maximum(end, last.value))
         if winds and suspect is not None:
-            if self._wound_from is None:
-                self._wound_from = last.value
-            value[suspect] = self._wound(suspect, float(last.value[suspect]), sample, dt)
+            value[suspect] = self._wound(suspect, last.value, sample, dt)
         return Command(LENGTH, value)
 
-    def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:
+    def _wound(self, muscle: int, commands: Array, sample: MuscleSample, dt: float) -> float:
         """Return the next length command [m] of a suspect muscle, which is wound in slowly.
 
         If the suspect has been wound in far enough, the last command is returned unchanged.
 
         Args:
             muscle: Index of the suspect.
-            command: Its last length command [m].
+            commands: The last length commands of all muscles [m], (M,).
             sample: The newest muscle states.
             dt: Time since the last command [s].
         """
-        assert self._wound_from is not None
+        if self._wound_from is None:
+            self._wound_from = commands
+        command = float(commands[muscle])
         length, tension = sample.newest.length[muscle], sample.newest.tension[muscle]
         actuation = self._setup.robot.actuation
         if actuation.rise(muscle, length, command, tension) > LARGEST_RISE:

@@ -373,12 +373,11 @@ class Estimator:
                 offsets were revoked, which only a length calibration ends. The anomaly then stays.
         """
         isolating = tuple(isolating)
-        verified = self.suspects.verified
+        service, verified = 'isolate' if isolating else 'reset', self.suspects.verified
         if verified is not None and verified not in isolating:
-            service = 'isolate' if isolating else 'reset'
             self._refuse_verified(service, 'if the anomaly is still present')
         suspected = self._suspected(isolating)
-        self._refuse_unrepaired(suspected, 'isolate' if isolating else 'reset')
+        self._refuse_unrepaired(suspected, service)
         self._note_checked(suspected)
         if self.body.offsets.revoked:
             raise MusculoskeletalError(f'{self.cause}; {self.advice}')

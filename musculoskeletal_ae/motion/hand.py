@@ -22,7 +22,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.holdable_paths import lacking, nearest_held
-from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
+from musculoskeletal_ae.motion.trajectory import JOINING, STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
 #: end the search of the inverse kinematics within these distances [m] and angles [rad]: WHOLE for
@@ -39,7 +39,6 @@ PATH_INTERVAL = 0.25
 PATH_SPEED = 1.0
 #: weight of the newest interval between poses in the average interval of a path
 INTERVAL_WEIGHT = 0.2
-JOINING = 0.1  # take at least this time to join a path [s]
 #: come to rest at the last pose of a path within this time after passing it [s]
 RETURNING = 2.0 * STOPPING
 TWIST_TIMEOUT = 0.3  # duration of the motion of the hand that one twist commands [s]

@@ -40,9 +40,9 @@ AT_ONCE = 0.01
 #: Refuse two successive times that are closer than this, relative to the later one: in a shorter
 #: piece of the curve, rounding errors of the time would matter.
 RESOLUTION = 1e-11
-#: Skip points, except the last, that a trajectory which began in the past would have to reach in
-#: less time than it is late, or than this [s]. Otherwise a point that is due at once would slow the
-#: whole trajectory down.
+#: Take at least this time to join a motion that is under way [s]; for a trajectory that is late by
+#: less than this, take as much time as it is late. Points that are due sooner are skipped, except
+#: the last: a point that is due at once would slow the whole trajectory down.
 JOINING = 0.1
 # Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
 # and acceleration at both ends.
@@ -268,7 +268,7 @@ class Trajectory:
         return Setpoint(theta, moving * velocity, moving * acceleration)
 
     def _original(self, time: Array) -> Setpoint:
-        """Return the setpoint of the curve before `eased`, at times from 0 to its end [s]."""
+        """Return the setpoint of the curve without its slowdown, at times from 0 to its end [s]."""
         piece = np.clip(np.searchsorted(self.time, time, side='right') - 1, 0, len(self.time) - 2)
         span = np.diff(self.time)[piece]
         tau = ((time - self.time[piece]) / span)[..., None]

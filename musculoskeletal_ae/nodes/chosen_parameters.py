@@ -24,7 +24,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import start_ros
 
 def arguments_of(node: str, arguments: Sequence[str]) -> Iterator[str]:
     """Yield the ROS arguments of a node: NODE:NAME:=VALUE of `-p` as NAME:=VALUE, or not at all."""
-    for flag, value in zip(['', *arguments], [*arguments, '']):
+    for flag, value in zip(['', *arguments], arguments):
         name = value.partition(':=')[0]
         if value == '-p':
             continue
@@ -40,10 +40,9 @@ def chosen_value(name: str, nodes: Sequence[str], arguments: Sequence[str]) -> o
     """Return the largest value that these nodes get for the parameter `name` by ROS arguments."""
     values = []
     for each in nodes:
-        own = [argument for argument in arguments_of(each, arguments) if argument]
         node = Node(
             each,
-            cli_args=own,
+            cli_args=[*arguments_of(each, arguments)],
             use_global_arguments=False,
             start_parameter_services=False,
             enable_rosout=False,

@@ -96,9 +96,10 @@ class Page:
         server.on_client_connect(self._on_connect)
         server.on_client_disconnect(self._on_disconnect)
 
-    # viser runs asynchronous callbacks in its event loop, one after the other and in the order of
-    # the events. It would run others in a pool of threads, in any order: a visitor who leaves at
-    # once could then be counted for ever. The order requires that the callbacks await nothing.
+    # viser runs asynchronous callbacks in its event loop, in the order of the events, as long as
+    # they await nothing. It would run other callbacks in a pool of threads, in any order: of a
+    # visitor who leaves at once, the departure could be handled before the arrival, and the visitor
+    # would count as present for ever.
 
     async def _on_connect(self, client: viser.ClientHandle) -> None:
         camera = client.camera

@@ -186,7 +186,11 @@ def unmeasured(mae):
 
 
 def swing(core, mae, seconds, true=(0.9, 0.3), push=0.0, is_free=True):
-    """Move joints with this damping; the network is updated every 10 s."""
+    """Move joints with the damping `true`, and return the network with what was measured.
+
+    Every 10 s, the estimate uses the damping measured so far. `push` is a torque along the motion
+    [N·m]; if `is_free` is false, the joint is at a stop.
+    """
     true, rng, used = np.array(true), np.random.default_rng(0), np.zeros(2)
     for n in range(round(seconds / DT)):
         if n % 1000 == 0 and (damped := core.put_into(mae)).elasticity is not None:

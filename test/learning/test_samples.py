@@ -132,28 +132,28 @@ def test_the_store_takes_only_new_postures_and_tensions():
     assert store.is_new(at(0.0, 0.0)._replace(tension=np.array([61.0])))
 
 
-def unseen(length, posture=(np.nan, np.nan)):
+def unmeasured(length, posture=(np.nan, np.nan)):
     return at(*posture)._replace(length=np.array([length]))
 
 
 def test_postures_are_new_after_a_rest_without_joint_angles():
     store = SampleStore()
-    store.add(unseen(0.0))
+    store.add(unmeasured(0.0))
     for angle in np.linspace(0.1, 1.0, 10):
-        seen = at(angle, 0.0)._replace(length=np.array([0.04 * angle]))
-        assert store.is_new(seen)
-        store.add(seen)
-        assert not store.is_new(seen)
-        assert not store.is_new(unseen(0.04 * angle))
-    assert store.is_new(unseen(0.08))
-    assert store.is_new(unseen(0.04, (1.0, 0.3)))
+        measured = at(angle, 0.0)._replace(length=np.array([0.04 * angle]))
+        assert store.is_new(measured)
+        store.add(measured)
+        assert not store.is_new(measured)
+        assert not store.is_new(unmeasured(0.04 * angle))
+    assert store.is_new(unmeasured(0.08))
+    assert store.is_new(unmeasured(0.04, (1.0, 0.3)))
 
 
 def test_a_sample_is_new_if_it_has_an_angle_that_a_similar_one_lacks():
     store = SampleStore()
-    store.add(unseen(0.0, (0.2, np.nan)))
-    assert not store.is_new(unseen(0.0, (0.2, np.nan)))
-    assert store.is_new(unseen(0.0, (0.2, 0.0)))
+    store.add(unmeasured(0.0, (0.2, np.nan)))
+    assert not store.is_new(unmeasured(0.0, (0.2, np.nan)))
+    assert store.is_new(unmeasured(0.0, (0.2, 0.0)))
 
 
 def test_a_full_store_keeps_a_posture_whose_lengths_differ_from_those_without_joint_angles():
@@ -161,7 +161,7 @@ def test_a_full_store_keeps_a_posture_whose_lengths_differ_from_those_without_jo
     far = at(0.0, 0.0)._replace(length=np.array([0.05]))
     store.add(far)
     for length in rng.uniform(-0.01, 0.01, 100):
-        store.add(unseen(length))
+        store.add(unmeasured(length))
     assert any(sample is far for sample in store.samples)
 
 
