@@ -275,5 +275,6 @@ def _keep(file: Path, previous: Path, temporary: Path) -> None:
             with temporary.open('rb') as copy:
                 os.fsync(copy.fileno())
         temporary.replace(previous)
-    finally:  # `replace` leaves it if both names were links to one file already
-        temporary.unlink(missing_ok=True)
+    finally:
+        if temporary.exists():  # `replace` leaves it if both were links to one file already
+            temporary.unlink()
