@@ -96,8 +96,10 @@ class ClosedLoop:
             DivergedError: If the emulated arm has diverged; no message comes from it then.
         """
         arm, core, read, now = self.arm, self.core, self._read, self.time
-        with suppress(MessageError):  # the nodes count and drop bad messages
+        # The nodes count and drop bad messages, each of them for itself.
+        with suppress(MessageError):
             core.take(read.muscles, now)
+        with suppress(MessageError):
             core.estimated(self.estimate(read, now), now)
         command = core.step(now)
         if command is not None:
