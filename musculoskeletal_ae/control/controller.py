@@ -51,9 +51,10 @@ from musculoskeletal_ae.motion.calibration_motion import Calibrating, gentle_lim
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
 from musculoskeletal_ae.motion.planner import NOT_HOLDABLE, Planner
+from musculoskeletal_ae.motion.present_motion import PresentMotion
 from musculoskeletal_ae.motion.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
-from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
@@ -171,6 +172,7 @@ class Controller:
         #: such estimate, for example after the start of a length calibration; the arm then does not
         #: move.
         self.estimate: Array | None = None
+        self.present_motion = PresentMotion()
         self.target_state = Target(np.zeros(robot.joint_count))
         self.supervisor = Supervisor()
         self.watchdog = Watchdog(setup, clock)
@@ -233,6 +235,7 @@ class Controller:
     def use(self, mae: Mae) -> None:
         """Use another network, which has been validated."""
         self.mae = mae
+        self.present_motion.forget()
         self.stream.use_transmission(mae.transmission)
         robot = self.robot.with_elasticity(mae.elasticity)
         if robot is not self.robot:
@@ -293,6 +296,7 @@ class Controller:
         self._estimate_problem.note('', now)
         if is_new:
             self.watchdog.estimate.use(now)
+            self.present_motion.step(theta, now)
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
@@ -316,6 +320,7 @@ class Controller:
 
     def _use_offsets(self, body: BodyState) -> None:
         before = self.stream.body.offsets
+        self.present_motion.forget()
         self.limiter.shift(body.offsets.offset - before.offset)
         self.stopping.shift(body.offsets.offset - before.offset)
         if self.sample is not None:
@@ -392,13 +397,14 @@ class Controller:
         Raises:
             MessageError: If the trajectory is refused; nothing is changed then.
         """
-        start, mae = self._ready(0.0 if points is None else max(delay, 0.0))
+        starts_in = 0.0 if points is None else max(delay, self._braking_time)
+        start, mae = self._ready(starts_in)
         if points is None:
             self._follow(self.planner.to_rest(start))
         else:
             lag = self.activities.follower.winches.lag
-            trajectory = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
-            self._follow(trajectory, delay=max(delay, 0.0))
+            trajectory = self.planner.through(mae, start, points, starts_in - delay, lag)
+            self._follow(trajectory, delay=starts_in)
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Move the end effector to a pose in the root link's frame.
@@ -719,11 +725,35 @@ class Controller:
 
     def _begin(self, trajectory: Trajectory, delay: float = 0.0) -> None:
         follower = self.activities.follower
-        if follower.progress.trajectory is None and delay > 0.0:
-            start, _ = self._ready()
-            follower.follow(self.planner.to_rest(start))
+        delay = max(delay, self._braking_time)
+        if delay > 0.0 and not self._is_on_trajectory:
+            follower.follow(self.planner.to_rest(self._present))
         follower.follow(trajectory, delay)
         self.supervisor.on_request(Activity.MOVING)
+
+    @property
+    def _is_on_trajectory(self) -> bool:
+        """Whether the arm is where a trajectory, which may have ended, demands it to be."""
+        progress = self.activities.follower.progress
+        return progress.trajectory is not None and not progress.has_fallen
+
+    @property
+    def _present(self) -> Setpoint:
+        """The estimated posture, within the joint limits, and its velocity."""
+        assert self.estimate is not None
+        inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
+        return self.present_motion.at(inside)
+
+    @property
+    def _braking_time(self) -> float:
+        """Time that the arm needs to come to rest before a trajectory [s].
+
+        The time is 0 if the arm rests. It is also 0 if the arm follows a trajectory, from whose
+        motion the next one can start.
+        """
+        if self._is_on_trajectory or self.estimate is None or not self._present.velocity.any():
+            return 0.0
+        return STOPPING
 
     @property
     def is_following(self) -> bool:
@@ -753,11 +783,9 @@ class Controller:
         if not self.stream.body.offsets.known:
             remedy = 'wait for the length calibration; if none is in progress, call estimator/zero'
             raise MessageError('length offsets are unknown', remedy)
-        progress = self.activities.follower.progress
-        if progress.trajectory is not None and not progress.has_fallen:
-            return progress.ahead(delay), self.mae
-        inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
-        return Setpoint.resting(inside), self.mae
+        if self._is_on_trajectory:
+            return self.activities.follower.progress.ahead(delay), self.mae
+        return Setpoint.resting(self.planner.to_rest(self._present).end), self.mae
 
     def _refuse_gravity_compensation(self) -> None:
         if self.settings.control_method.is_guided:

@@ -179,13 +179,13 @@ def test_the_length_command_is_the_length_itself():
 
 @cache
 def loop_after(method):
-    """Return a loop after 3.5 s, in which the arm moved to its target, if the method has one."""
+    """Return a loop after 5 s, in which the arm moved to its target, if the method has one."""
     arm = EmulatedArm(ROBOT, 0, Individual(ROBOT, 0, NOMINAL))
     loop = WithJointSensors(arm, ExactMae(ROBOT), Settings(method=method, first_duration=1.0))
     loop.wait(0.1)
     if method != 'float':
         loop.target(THETA)
-    loop.wait(3.5)
+    loop.wait(5.0)
     return loop
 
 

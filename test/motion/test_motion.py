@@ -144,6 +144,26 @@ def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_slowly(bench):
     assert resumed.duration >= bench.core.settings.first_duration
 
 
+def test_a_motion_of_an_arm_that_another_activity_moves_first_brings_it_to_rest(bench):
+    """A plan that took a moving arm for a resting one carried it beyond its target."""
+    assert bench.core.explore(True) == ''
+    velocity, start = np.array([-0.8, 0.5]), REST + [0.4, -0.25]
+    for n in range(51):
+        bench.theta = start + velocity * DT * n
+        bench.step()
+    bench.target(OTHER)
+    bench.step()
+    desired = bench.follower.progress.desired
+    np.testing.assert_allclose(desired.velocity, velocity, rtol=0.1)
+    sent = moved(bench, round(STOPPING / DT))
+    desired = bench.follower.progress.desired
+    np.testing.assert_allclose(desired.theta, REST + 0.5 * STOPPING * velocity, atol=0.02)
+    np.testing.assert_allclose(desired.velocity, 0.0, atol=0.02)
+    moved(bench, 700)
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
+    assert all(command is not None for command in sent)
+
+
 def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
     bench.core.trajectory(points(OTHER))
     sent = moved(bench, 50)
