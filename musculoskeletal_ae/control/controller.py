@@ -277,10 +277,16 @@ class Controller:
             if not self._awaited_samples:
                 self.limiter.restart(sample, self.supervisor.is_running)
 
-    def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
+    def estimated(
+        self, theta: Array, now: float, is_new: bool = True, time: float | None = None
+    ) -> None:
         """Check the estimated posture θ [rad], (D,), and use it for control from now on.
 
-        A repeated estimate, with `is_new` false, does not count as new data for the watchdog.
+        Args:
+            theta: The posture.
+            now: Time of reception by the steady clock [s].
+            is_new: False for a repeated estimate, which is no new data for the watchdog.
+            time: Time of the posture by the messages' clock [s]; None if this is the steady clock.
 
         Raises:
             MessageError: If the posture is implausible.
@@ -296,7 +302,7 @@ class Controller:
         self._estimate_problem.note('', now)
         if is_new:
             self.watchdog.estimate.use(now)
-            self.present_motion.step(theta, now)
+            self.present_motion.step(theta, now if time is None else time)
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
@@ -307,6 +313,7 @@ class Controller:
         self.stream.use_body(body)
         if body.isolated != before.isolated:
             self.setup.robot = self.robot.without(body.isolated)
+            self.present_motion.forget()  # the estimate uses other muscles now
             self.target_state.unreachable_reason = ''
             if self.mae is not None:
                 self.activities.follower.plan_anew()
@@ -344,6 +351,7 @@ class Controller:
         """
         self.watchdog.steps.clock_jumped_back()
         self.stream.reset()
+        self.present_motion.forget()
 
     # -- commands from users --------------------------------------------------------------------
 
@@ -397,14 +405,13 @@ class Controller:
         Raises:
             MessageError: If the trajectory is refused; nothing is changed then.
         """
-        starts_in = 0.0 if points is None else max(delay, self._braking_time)
-        start, mae = self._ready(starts_in)
+        start, mae = self._ready(0.0 if points is None else max(delay, 0.0))
         if points is None:
             self._follow(self.planner.to_rest(start))
         else:
             lag = self.activities.follower.winches.lag
-            trajectory = self.planner.through(mae, start, points, starts_in - delay, lag)
-            self._follow(trajectory, delay=starts_in)
+            trajectory = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
+            self._follow(trajectory, delay=max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Move the end effector to a pose in the root link's frame.
@@ -741,8 +748,7 @@ class Controller:
     def _present(self) -> Setpoint:
         """The estimated posture, within the joint limits, and its velocity."""
         assert self.estimate is not None
-        inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
-        return self.present_motion.at(inside)
+        return self.present_motion.setpoint(self.estimate, self.robot)
 
     @property
     def _braking_time(self) -> float:

@@ -177,7 +177,7 @@ class ControllerNode(Shell):
         sent = nanoseconds(message.header.stamp)
         if is_new := is_later(sent, self.estimate_sent):
             self.estimate_sent = sent
-        self.core.estimated(theta, time.monotonic(), is_new)
+        self.core.estimated(theta, time.monotonic(), is_new, 1e-9 * sent)
         # Compute a command now. An estimate comes from the newest muscle states, so all inputs are
         # fresh.
         self._step()

@@ -144,13 +144,18 @@ def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_slowly(bench):
     assert resumed.duration >= bench.core.settings.first_duration
 
 
+def exploring(bench, velocity, end):
+    """Let the arm of an exploring bench move with `velocity` [rad/s] until it is at `end`."""
+    assert bench.core.explore(True) == ''
+    for n in range(50, -1, -1):
+        bench.theta = end - velocity * DT * n
+        bench.step()
+
+
 def test_a_motion_of_an_arm_that_another_activity_moves_first_brings_it_to_rest(bench):
     """A plan that took a moving arm for a resting one carried it beyond its target."""
-    assert bench.core.explore(True) == ''
-    velocity, start = np.array([-0.8, 0.5]), REST + [0.4, -0.25]
-    for n in range(51):
-        bench.theta = start + velocity * DT * n
-        bench.step()
+    velocity = np.array([-0.8, 0.5])
+    exploring(bench, velocity, REST)
     bench.target(OTHER)
     bench.step()
     desired = bench.follower.progress.desired
@@ -162,6 +167,41 @@ def test_a_motion_of_an_arm_that_another_activity_moves_first_brings_it_to_rest(
     moved(bench, 700)
     np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
     assert all(command is not None for command in sent)
+
+
+@pytest.mark.parametrize('duration', [0.0, 0.1, 0.5])
+def test_a_short_trajectory_of_a_moving_arm_follows_once_the_arm_is_at_rest(bench, duration):
+    exploring(bench, np.array([-0.8, 0.5]), REST)
+    bench.core.trajectory(TrajectoryPoints(*points(OTHER, duration)[:3], None, None))
+    moved(bench, 300)
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
+
+
+def test_an_arm_that_moves_towards_its_limit_comes_to_rest_before_it():
+    velocity, end = np.array([1.0, 0.0]), ROBOT.upper - np.array([0.03, 0.5])
+    bench = Bench()
+    bench.theta = end - velocity * DT * 50
+    bench.step(5)
+    exploring(bench, velocity, end)
+    bench.core.trajectory(None)
+    desired = []
+    for _ in range(30):
+        moved(bench, 1)
+        desired.append(bench.follower.progress.desired.theta)
+    assert (np.array(desired) <= ROBOT.upper + 1e-9).all()
+    assert bench.follower.progress.desired.theta[0] > end[0] + 0.02
+
+
+def test_another_estimate_of_a_resting_arm_is_no_motion(bench):
+    """With other muscles or another network, the estimate jumps."""
+    bench.core.explore(True)
+    bench.step(50)
+    bench.isolate([0])
+    bench.theta = REST + 0.1
+    bench.step()
+    bench.core.trajectory(points(OTHER))
+    bench.step()
+    assert np.abs(bench.follower.progress.desired.velocity).max() < 0.1
 
 
 def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
@@ -351,7 +391,7 @@ def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench)
     assert 0.9 < (demanded / limits.limit).max() <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize('time', [90.0, 0.0])
+@pytest.mark.parametrize('time', [90.0, pytest.param(0.0, marks=pytest.mark.thorough)])
 def test_rest_feedback_pushes_in_every_direction_until_the_arm_has_arrived(time):
     # Lengths alone exert almost no torque in directions in which few muscles pull harder than
     # T_bias: the others cannot be relaxed any further. Without a measured residual torque, there
