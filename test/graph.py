@@ -217,8 +217,8 @@ class Graph:
     def spin(self, seconds: float) -> None:
         """Process messages for a time [s]."""
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(LOOK)
+        while (left := end - time.monotonic()) > 0.0:
+            self.executor.spin_once(min(LOOK, left))
 
     @contextmanager
     def spinning(self) -> Iterator[None]:

@@ -50,7 +50,7 @@ def messages(path, namespace):
 
 
 def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
-    content = samples.samples(252, '/left_arm')
+    content = samples.samples(126, '/left_arm')
     samples.write_ours(tmp_path / 'first', content, 'zstd', finish=True)
     recorder = record(tool, graph, tmp_path / 'second')
     replay = tool('replay', tmp_path / 'first', '--topics', 'all', '--wait', '20', *ros(graph))
@@ -168,7 +168,7 @@ def test_messages_that_a_recorder_misses_are_counted(tool, graph, tmp_path):
         nonlocal count
         count += 1
         publisher.publish(large)
-        graph.spin(0.01)
+        graph.spin(0.002)
 
     def recorded():
         topics = Bag.open(tmp_path / 'bag').topics
@@ -289,15 +289,16 @@ def test_a_slow_node_misses_nothing_of_a_replay_that_waits_for_it(tool, graph, t
 
 
 def test_a_replay_begins_when_the_nodes_run_that_it_waits_for(tool, graph, tmp_path):
-    content = [s for s in samples.samples(200, '') if s.topic == '/muscle_states']
+    content = [s for s in samples.samples(100, '') if s.topic == '/muscle_states']
     samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
     clock = graph.listen(Clock, '/clock', 1000)
     graph.listen(DiagnosticArray, '/diagnostics')
     received = graph.listen(Float64MultiArray, 'muscle_states')
-    replay = tool('replay', tmp_path / 'bag', '--clock', '--wait-for', 'test,late', *ros(graph))
+    options = ['--clock', '--wait', '0.2', '--wait-for', 'test,late']
+    replay = tool('replay', tmp_path / 'bag', *options, *ros(graph))
     graph.wait(lambda: 'late' in graph.report('replay').message, 'the replay to wait for `late`')
     assert graph.report('replay').values['state'] == 'waiting'
-    graph.spin(1.5 * replay_tool.WAIT)
+    graph.spin(0.5)
     assert not received
     late = rclpy.create_node('late', context=graph.context, namespace=graph.namespace)
     graph.hosted.append(late)

@@ -97,6 +97,7 @@ def test_a_push_turns_the_nominal_arm_by_the_predicted_ratio(robot, mae):
     assert predicted.max() > 1.2  # a ratio of 1 would be a trivial prediction
 
 
+@pytest.mark.thorough
 def test_a_push_turns_bodies_with_friction_by_about_the_predicted_ratio(robot, mae):
     # The push is much larger than friction. The ratio of a single arm still differs by 0.1 from the
     # prediction, so this test compares the mean of three arms.

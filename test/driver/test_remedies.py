@@ -786,6 +786,8 @@ def test_a_fault_that_listening_finds_is_gone_after_the_change(name):
     before = listen(case)
     assert {fault.kind for fault in before.faults} == {fault_name}, str(before)
     assert case.advice in before.faults[0].remedy
+    assert not before.allows_motion
+    assert before.conclusion == 'driver check FAILED: fix the faults above'
     for change in case.changes:
         faults = before.faults
         if change is publish_in_order:  # the faults describe one order together

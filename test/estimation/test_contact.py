@@ -211,6 +211,7 @@ def test_damping_is_measured_and_kept_in_the_network(robot, mae):
     np.testing.assert_array_equal(contact.damping, damped.elasticity.damping)
 
 
+@pytest.mark.thorough
 def test_damping_is_found_even_if_it_exceeds_the_noise_by_far(robot, mae):
     core = HealthyTorque(robot)
     swing(core, unmeasured(mae), 100.0, true=(0.0, 0.0))

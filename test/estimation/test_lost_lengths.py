@@ -220,7 +220,7 @@ def test_a_muscle_that_is_restored_during_a_calibration_is_calibrated_as_well(ro
     np.testing.assert_allclose(arm.offsets.offset, arm.off, atol=2e-3)
 
 
-@pytest.mark.parametrize('pair', [(0, 2), (1, 4)])
+@pytest.mark.parametrize('pair', [(0, 2), pytest.param((1, 4), marks=pytest.mark.thorough)])
 def test_exchanged_muscles_are_named_instead_of_lost_offsets(robot, calibrated, pair):
     arm = MovingArm(robot, calibrated)
     arm.go(10.0, sensors=False)

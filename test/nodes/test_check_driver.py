@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`check_driver` on the graph: it waits, checks a live driver, and moves only if asked to."""
 
-import signal
-from argparse import Namespace
 from contextlib import redirect_stdout
 from io import StringIO
 
@@ -14,11 +12,16 @@ from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros_tools import check_driver
 
 RATE = 50.0  # rate of the driver's messages [Hz]; 100 Hz would take twice the processor time
 COMMON = ['--robot', 'arm26', '--rate', f'{RATE:g}']
+
+
+@pytest.fixture(autouse=True)
+def discovers_at_once(monkeypatch):
+    """Shorten the time for the discovery of other nodes, because the graph is in this process."""
+    monkeypatch.setattr(check_driver, 'DISCOVERY_TIME', 0.3)
 
 
 def check(graph, *options):
@@ -87,31 +90,12 @@ def test_with_wait_check_driver_reports_faults_until_the_driver_is_right_and_mov
     assert not commands
 
 
-def test_check_driver_says_what_it_does_and_the_remaining_time_and_ctrl_c_ends_it(graph):
-    process = check(graph, '--seconds', '1010')
-    publisher = graph.publisher(Float64MultiArray, 'muscle_states')
-
-    def is_listening():
-        publisher.publish(Float64MultiArray())
-        graph.spin(0.1)
-        return 'listening for 1010 s' in process.output
-
-    graph.wait(is_listening, 'the instruction')
-    process.wait_for_output('1000 s left')
-    status, output = process.end(signal.SIGINT)
-    assert status == 130
-    assert 'Traceback' not in output
-
-
-def test_what_to_do_while_check_driver_listens_depends_on_arm_and_options():
-    robot = Robot.load('arm26')
-    options = {'move': False, 'posture': None}
-    cases = [({}, True), ({}, False), ({'move': True}, True), ({'posture': [0.0, 0.0]}, False)]
-    instructions = {
-        check_driver._instruction(robot, Namespace(**options | changes), has_joint_sensors)
-        for changes, has_joint_sensors in cases
-    }
-    assert len(instructions) == len(cases)
+def test_check_driver_says_what_it_does_and_the_remaining_time(graph, monkeypatch, capsys):
+    monkeypatch.setattr(check_driver, 'COUNTDOWN', 0.2)
+    start_driver(graph)
+    check_here(graph, '--seconds', '0.5')
+    output = capsys.readouterr().out
+    assert 'listening for 0.5 s' in output and 's left' in output
 
 
 @pytest.mark.parametrize(
@@ -153,7 +137,7 @@ def test_a_second_node_on_a_topic_of_the_driver_is_a_fault(graph, capsys, topic)
     start_driver(graph)
     kinds = {'muscle_states': Float64MultiArray, 'joint_states': JointState}
     graph.node.create_publisher(kinds[topic], topic, 10)
-    assert check_here(graph, '--seconds', '1.5') == 1
+    assert check_here(graph, '--seconds', '0.6') == 1
     output = capsys.readouterr().out
     nodes = f'{graph.namespace}/hardware_emulator and {graph.namespace}/test'
     assert f'{graph.namespace}/{topic} come from {nodes}' in output

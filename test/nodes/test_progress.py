@@ -16,7 +16,7 @@ from musculoskeletal_ae.ros.hang_detection import STALLED, ProgressWatch, waited
 START = (
     'from musculoskeletal_ae.ros.hang_detection import ProgressWatch\n'
     'import time\n'
-    'watch = ProgressWatch(longest=1.0, look_period=0.1)\n'
+    'watch = ProgressWatch(longest=0.5, look_period=0.1)\n'
     'watch.start()\n'
     'print("started", flush=True)\n'
 )
@@ -48,18 +48,18 @@ def test_without_progress_the_process_ends_with_the_stacks_in_its_log(run):
 
 
 def test_a_native_call_that_keeps_the_lock_of_python_ends_the_process_too(run):
-    process = run('sum(range(10**12))', START.replace('longest=1.0', 'longest=0.3'))
+    process = run('sum(range(10**12))', START.replace('longest=0.5', 'longest=0.3'))
     _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == -signal.SIGVTALRM
     assert 'most recent call first' in errors
 
 
 def test_a_suspended_process_is_no_process_that_hangs(run):
-    process = run('end = time.monotonic() + 2.5\nwhile time.monotonic() < end:\n'
+    process = run('end = time.monotonic() + 1.4\nwhile time.monotonic() < end:\n'
                   '    watch.note(); time.sleep(0.05)\nwatch.stop()')  # fmt: skip
     assert process.stdout is not None and process.stdout.readline() == 'started\n'
     process.send_signal(signal.SIGSTOP)
-    time.sleep(1.5)
+    time.sleep(0.8)
     process.send_signal(signal.SIGCONT)
     _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == 0, errors
@@ -67,9 +67,9 @@ def test_a_suspended_process_is_no_process_that_hangs(run):
 
 def test_progress_keeps_the_watch_quiet_until_it_ends():
     stalled = threading.Event()
-    watch = ProgressWatch(longest=1.0, look_period=0.05, on_stall=stalled.set)
+    watch = ProgressWatch(longest=0.5, look_period=0.05, on_stall=stalled.set)
     watch.start()
-    for _ in range(30):
+    for _ in range(15):
         watch.note()
         assert not stalled.wait(0.05)
     assert stalled.wait(DEADLINE)

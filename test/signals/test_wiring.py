@@ -32,7 +32,9 @@ def judged(name, wiring, theta, length, tension, **options):
 
 
 @pytest.mark.parametrize('name', ROBOTS)
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize(
+    'seed', [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))]
+)
 def test_every_exchange_and_every_reversed_sign_is_named(name, seed):
     straight, data = Wiring.straight(ROBOTS[name].muscle_count), readings(name, seed)
     assert not judged(name, straight, *data).is_faulty
