@@ -45,8 +45,8 @@ def test_the_error_of_a_network_that_has_learned_the_body_is_smaller(learned, in
 
 
 def test_a_table_of_rests_is_learned_until_the_network_has_converged(arm26, initial, monkeypatch):
-    monkeypatch.setattr(recordings, 'STEPS', 40)  # fewer steps in each update
-    theta, tension, length = Stage(drawn_body(arm26, 7, 3, 0.7)).states(40)
+    monkeypatch.setattr(recordings, 'STEPS', 20)  # fewer steps in each update
+    theta, tension, length = Stage(drawn_body(arm26, 7, 3, 0.7)).states(20)
     learner = Learner(arm26, initial)
     assert learn_table(learner, Table.of(arm26, theta, length, tension)) == ''
     assert LEAST_UPDATES <= learner.updates <= MOST_UPDATES

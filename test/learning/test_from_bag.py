@@ -164,7 +164,9 @@ def test_wrong_bags_and_options_end_with_one_clear_error(
     assert not out.exists()
 
 
-@pytest.mark.parametrize('fault', ['joint sensor', 'muscles'])
+@pytest.mark.parametrize(
+    'fault', ['joint sensor', pytest.param('muscles', marks=pytest.mark.thorough)]
+)
 def test_progress_and_faults_of_the_readings_are_reported(
     fault, arm26, initial, monkeypatch, tmp_path, capsys
 ):

@@ -53,6 +53,7 @@ def test_a_mujoco_file_is_imported_explored_and_learned_until_the_emulated_arm_d
     mujoco.MjModel.from_xml_path(str(tmp_path / 'arm_model' / EXAMPLE.name))
 
 
+@pytest.mark.thorough
 def test_a_finger_with_a_spring_return_explores_and_learns(tmp_path):
     (tmp_path / 'finger.xml').write_text(bodies.SNAPPING)
     robot = import_robot(tmp_path / 'finger.xml', tmp_path / 'robot').robot
