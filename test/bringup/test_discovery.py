@@ -32,6 +32,7 @@ time.sleep(1.0)  # let the other node discover this one
 LONGEST = 60.0  # wait at most this long for the end of a search on a busy machine [s]
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(
     os.environ.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp') != 'rmw_fastrtps_cpp',
     reason='the profile is one of Fast DDS',

@@ -3,6 +3,7 @@
 
 import sys
 
+import pytest
 from graph import Process
 from std_msgs.msg import Float64MultiArray
 
@@ -10,6 +11,7 @@ from bench.wire import ALONE
 from musculoskeletal_ae.signals.muscle_states import QUANTITIES
 
 
+@pytest.mark.thorough
 def test_a_bare_node_publishes_readings_of_the_size_of_the_robot(graph, arm26):
     topic = f'{graph.namespace}/muscle_states'
     messages = graph.listen(Float64MultiArray, topic)

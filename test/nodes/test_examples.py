@@ -51,6 +51,7 @@ def runs(graph, process, name):
         process.wait_for_output(FIRST[name])
 
 
+@pytest.mark.thorough
 def test_an_example_that_takes_long_to_start_ends_silently_meanwhile(graph, tmp_path):
     start(graph, 'learn_in_python.py', tmp_path).ends_silently(signal.SIGINT)
 

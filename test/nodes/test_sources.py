@@ -225,7 +225,9 @@ def test_a_second_clock_stops_the_nodes_that_use_it(graph):
     graph.wait(lambda: not follower.intruders, 'the end of the second clock')
 
 
-@pytest.mark.parametrize('denial', [Anomaly.NONE, Anomaly.ENDED])
+@pytest.mark.parametrize(
+    'denial', [Anomaly.NONE, pytest.param(Anomaly.ENDED, marks=pytest.mark.thorough)]
+)
 def test_another_node_cannot_end_an_anomaly(graph, arm26, trained_file, denial):
     arm = ControlledArm(graph, arm26, trained_file)
     core, name = arm.controller.core, arm26.muscles[3]
