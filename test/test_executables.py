@@ -38,10 +38,10 @@ INTERRUPTED = 'record', 'train', 'view'
 SIGNALS = [
     ('combined', signal.SIGINT, 0.3),
     ('combined', signal.SIGTERM, 0.9),
-    ('combined', signal.SIGINT, 2.0),
-    ('learner', signal.SIGTERM, 2.0),
 ]
 FURTHER_SIGNALS = [
+    ('combined', signal.SIGINT, 2.0),
+    ('learner', signal.SIGTERM, 2.0),
     ('combined', signal.SIGTERM, 2.0),
     ('learner', signal.SIGINT, 0.3),
     ('learner', signal.SIGTERM, 0.9),

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from musculoskeletal_ae.experiments import results
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
@@ -21,9 +22,11 @@ def quick(alone) -> Path:
     with alone('experiments') as common:
         folder, done = common / 'experiments', common / 'experiments_done'
         if not done.exists():
-            options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2'
+            options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 1'
             files = f'--out {folder} --keep {common / KEPT}'
-            assert experiment.main([*options.split(), *files.split()]) == 0
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(results, 'DPI', 30)  # plots are drawn faster
+                assert experiment.main([*options.split(), *files.split()]) == 0
             done.touch()
     return folder
 

@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.control.settings import Settings
@@ -32,6 +33,7 @@ def saved_numbers(study):
     return saved_results.read(study.folder / 'online_learning_0.npz').numbers
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_numbers_and_network_in_another_process(
     study, tmp_path, monkeypatch
 ):

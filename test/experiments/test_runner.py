@@ -192,6 +192,7 @@ def test_a_cluster_needs_dask(monkeypatch):
         pass
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ('address', 'problem'),
     [('tcp://127.0.0.1:1', 'no Dask scheduler answers'), ('a', 'expected the address')],

@@ -3,6 +3,7 @@
 
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -164,9 +165,7 @@ def test_wrong_bags_and_options_end_with_one_clear_error(
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    'fault', ['joint sensor', pytest.param('muscles', marks=pytest.mark.thorough)]
-)
+@pytest.mark.parametrize('fault', ['joint sensor', 'muscles'])
 def test_progress_and_faults_of_the_readings_are_reported(
     fault, arm26, initial, monkeypatch, tmp_path, capsys
 ):
@@ -192,6 +191,8 @@ def test_progress_and_faults_of_the_readings_are_reported(
 
     monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.0)
     monkeypatch.setattr(convergence, 'MOST_UPDATES', 1)
+    monkeypatch.setattr(recordings, 'STEPS', 1)
+    monkeypatch.setattr(recording_learning, 'Learner', partial(Learner, steps=1))
     monkeypatch.setattr(model_training, 'initial_mae', trained)
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
     out = str(tmp_path / 'out.safetensors')

@@ -132,6 +132,7 @@ def test_a_slipped_joint_sensor_is_not_taken_for_a_changed_muscle(arm26, initial
     assert updater.update(job(store, steps=1)).changed == ()
 
 
+@pytest.mark.thorough
 def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_body):
     data = synthetic_samples(other_body, np.zeros(6), 200, np.random.default_rng(0))
     # Tensors on the device `meta` have no values. Training therefore runs to its end, where reading
@@ -206,6 +207,7 @@ def test_a_restarted_learner_continues_with_small_changes(learned, arm26):
     assert learned_steps(updates[0].mae) == learned_steps(mae) + 60
 
 
+@pytest.mark.thorough
 def test_a_network_of_another_arm_adapts_as_fast_as_an_initial_one(learned, arm26, initial):
     stage = Stage(drawn_body(arm26, 8, 5, 1.0))
     states = stage.states(1000)

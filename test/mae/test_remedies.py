@@ -44,6 +44,7 @@ def test_another_checkpoint_is_used_after_the_advice(name, trained_file, tmp_pat
     )
 
 
+@pytest.mark.thorough
 def test_a_checkpoint_that_train_makes_is_used_after_the_advice(trained_file, tmp_path):
     """The robot was changed, so its checkpoint names other muscles."""
     document = read_muscles(copy_robot('arm26', tmp_path))

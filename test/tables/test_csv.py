@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning import convergence, learner
+from musculoskeletal_ae.learning import convergence, learner, recordings
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.robot import Robot
@@ -227,8 +227,9 @@ def test_rows_of_a_motion_without_times_are_noticed(arm26):
 
 @pytest.fixture
 def trained(trained_file, tmp_path, monkeypatch):
-    """Return a function that runs `train --from-csv` with few updates."""
+    """Return a function that runs `train --from-csv` with few and short updates."""
     monkeypatch.setattr(convergence, 'MOST_UPDATES', 2)
+    monkeypatch.setattr(recordings, 'STEPS', 100)
     out = tmp_path / 'out.safetensors'
 
     def run(*options):
