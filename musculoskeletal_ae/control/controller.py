@@ -732,9 +732,12 @@ class Controller:
 
     def _begin(self, trajectory: Trajectory, delay: float = 0.0) -> None:
         follower = self.activities.follower
-        delay = max(delay, self._braking_time)
-        if delay > 0.0 and not self._is_on_trajectory:
-            follower.follow(self.planner.to_rest(self._present))
+        if not self._is_on_trajectory:
+            present = self._present
+            if present.velocity.any():  # the arm first comes to rest
+                delay = max(delay, STOPPING)
+            if delay > 0.0:
+                follower.follow(self.planner.to_rest(present))
         follower.follow(trajectory, delay)
         self.supervisor.on_request(Activity.MOVING)
 
@@ -749,17 +752,6 @@ class Controller:
         """The estimated posture, within the joint limits, and its velocity."""
         assert self.estimate is not None
         return self.present_motion.setpoint(self.estimate, self.robot)
-
-    @property
-    def _braking_time(self) -> float:
-        """Time that the arm needs to come to rest before a trajectory [s].
-
-        The time is 0 if the arm rests. It is also 0 if the arm follows a trajectory, from whose
-        motion the next one can start.
-        """
-        if self._is_on_trajectory or self.estimate is None or not self._present.velocity.any():
-            return 0.0
-        return STOPPING
 
     @property
     def is_following(self) -> bool:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures how the arm moves at present, so that a motion can start from there.
+"""Measures the present velocity of the joints, from which a new motion starts.
 
 The velocity is the derivative of the estimated posture, smoothed with the time constant SMOOTHING:
 
     dv/dt = (dθ/dt − v) / SMOOTHING
 
-Its time is that of the messages, because late messages may be received together.
+The times are those at which the estimates were sent, because late messages may be received
+together.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class PresentMotion:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the estimates so far, because the next one may differ for other reasons."""
+        """Forget the estimates: the next one may differ although the arm has not moved."""
         self._last: tuple[float, Array] | None = None
         self._velocity: Array | float = 0.0
 
@@ -46,10 +47,14 @@ class PresentMotion:
         self._last = time, theta
 
     def setpoint(self, theta: Array, robot: Robot) -> Setpoint:
-        """Return the setpoint of an arm that moves as measured, at the estimate θ [rad], (D,).
+        """Return posture and velocity of the arm, without acceleration.
 
-        The setpoint is within the joint limits, and so slow that the arm comes to rest within them
-        in the time STOPPING.
+        Both are limited so that the arm can come to rest within the joint limits in the time
+        STOPPING. The velocity of a resting joint is 0.
+
+        Args:
+            theta: The estimated posture θ [rad], (D,).
+            robot: Provides the joint limits.
         """
         inside = np.clip(theta, robot.lower, robot.upper)
         ways = (robot.lower - inside, robot.upper - inside)

@@ -870,16 +870,18 @@ def test_weak_muscles_are_not_pulled_far_beyond_their_maximum(wrong, check):
     [
         ('drop:0.4', {'rate'}, 'rate of all muscles'),
         pytest.param(
-            *('delay:0.2', {'latency'}, 'latency of biceps_long'), marks=pytest.mark.thorough
+            'delay:0.2', {'latency'}, 'latency of biceps_long', marks=pytest.mark.thorough
         ),
-        pytest.param(*('duplicate:0.5', {'rate'}, 'rate'), marks=pytest.mark.thorough),
+        pytest.param('duplicate:0.5', {'rate'}, 'rate', marks=pytest.mark.thorough),
         pytest.param(
-            *('freeze:biceps_long', {'rate', 'law'}, 'its reading is the same in every message'),
+            'freeze:biceps_long',
+            {'rate', 'law'},
+            'its reading is the same in every message',
             marks=pytest.mark.thorough,
         ),
         ('dead_sensor:biceps_long', {'rate', 'law'}, 'biceps_long'),
         pytest.param(
-            *('bias:biceps_long:0.1', {'zero'}, 'zero of biceps_long'), marks=pytest.mark.thorough
+            'bias:biceps_long:0.1', {'zero'}, 'zero of biceps_long', marks=pytest.mark.thorough
         ),
         ('bias:tension:biceps_long:40', {'law'}, 'biceps_long'),
     ],
