@@ -69,6 +69,7 @@ def test_hostile_messages_can_be_sent_and_recognised():
     assert digest(Float64MultiArray(data=[1.0])) == digest(Float64MultiArray(data=[1.0]))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures('both_cores')
 def test_a_quick_attack_breaks_no_promise(trained_file, tmp_path, capsys):
     # The arm recovers from this kind of attack within seconds.

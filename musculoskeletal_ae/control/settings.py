@@ -137,7 +137,7 @@ class Settings:
     second_duration: float = 2.0
     #: duration of a movement to a target with method `stiffness`, or with method `proposed` of
     #: preset `default` [s]; extended if muscle modules or muscles are too weak
-    target_duration: float = 1.2
+    target_duration: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the fields that are parameters, and turn lists into tuples.

@@ -29,7 +29,7 @@ DEADLINE = 120.0  # longest wait for the browser [s]
 #: script that lowers the frame rate, because drawing without a graphics card occupies a core
 SLOWLY = """
 const soon = window.requestAnimationFrame.bind(window);
-window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 300);
+window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 1000);
 """
 #: script that notes the text of each button that receives a click
 NOTE_PRESSED = """
