@@ -26,7 +26,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.ros.message_building import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets, Trust
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # let an attack last for this time [s]
@@ -220,6 +220,7 @@ def _body(
     scene: Scene,
     offset: float = 0.0,
     deviation: float = 0.0,
+    trust: Trust = Trust.KNOWN,
     isolated: Sequence[int] = (),
     anomaly: Anomaly = Anomaly.NONE,
 ) -> Float64MultiArray:
@@ -229,12 +230,13 @@ def _body(
         scene: The attacked arm, whose present body state is falsified.
         offset: Absolute value of the length offsets, whose signs alternate [m].
         deviation: Standard deviation that the body state states for the offsets [m].
+        trust: Whether it states that the offsets may be used.
         isolated: Indices of the muscles that are isolated.
         anomaly: State of the anomaly.
     """
     muscles = scene.attack.robot.muscle_count
     sign = np.where(np.arange(muscles) % 2, 1.0, -1.0)
-    offsets = LengthOffsets(sign * offset, np.full(muscles, deviation))
+    offsets = LengthOffsets.of(sign * offset, deviation, trust)
     suspect = None if anomaly is Anomaly.NONE else 0
     generation = scene.rng.randrange(1, 2**50)
     body = BodyState(offsets, tuple(isolated), anomaly, suspect, generation)
@@ -243,7 +245,7 @@ def _body(
 
 def zeros_unknown_then_false(scene: Scene) -> None:
     """Publish unknown length offsets, then false ones."""
-    scene.latch('body_state', _body(scene, 0.0, 1.0), _body(scene, OFFSET, 1e-3))
+    scene.latch('body_state', _body(scene, trust=Trust.UNKNOWN), _body(scene, OFFSET, 1e-3))
 
 
 def zeros_false(scene: Scene) -> None:

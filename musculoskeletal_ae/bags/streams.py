@@ -16,19 +16,18 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
-from musculoskeletal_ae.bags.topics import EARLIER, interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
     read_array,
-    read_names,
     read_posture,
 )
 from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
-from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_states import QUANTITIES, MuscleReadings, raw_muscle_states
@@ -154,14 +153,10 @@ class _ArmStreams:
         muscles = robot.muscle_count
         self._bodies: list[BodyState] = []
         self._body = _Stream((ROWS, muscles), self._body_rows)
-        self._isolated = _Stream((muscles,), self._isolated_mask)
-        self._offsets = _Stream((3, muscles), self._offset_rows)
         self.by_topic = {
             'joint_states': _Stream((robot.joint_count,), self._posture),
             'muscle_states': _Stream((len(QUANTITIES), muscles), self._muscle_states),
             'body_state': self._body,
-            'isolated_muscles': self._isolated,
-            'muscle_length_zeros': self._offsets,
         }
 
     def _posture(self, message: Any, _: Arrival) -> Array:
@@ -205,23 +200,10 @@ class _ArmStreams:
         self._bodies.append(body)
         return body.rows
 
-    def _offset_rows(self, message: Any, _: Arrival) -> Array:
-        muscles = self._robot.muscle_count
-        if len(message.data) == 2 * muscles:  # version 0.1.0 published no trust
-            offsets = LengthOffsets(*read_array(message, 2, muscles))
-        else:  # later versions published trust, and a generation
-            offset, deviation, trust, _ = read_array(message, 4, muscles)
-            offsets = LengthOffsets(offset, deviation, trust)
-        return BodyState.of_rows(BodyState(offsets).rows).offsets.rows
-
-    def _isolated_mask(self, message: Any, _: Arrival) -> Array:
-        indices = self._robot.muscle_indices(read_names(message))
-        return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
-
     def isolated(self) -> Series:
         """Return the isolated muscles in each message that states them, as 1, others as 0."""
         time, rows = self._body.series()
-        return Series(time, rows[:, ISOLATED_ROW]) if len(time) else self._isolated.series()
+        return Series(time, rows[:, ISOLATED_ROW])
 
     def _body_at(self, time: float, before: BodyState) -> BodyState:
         """Return the body state at a time [s] of the recording; `before` if nothing has changed.
@@ -230,28 +212,12 @@ class _ArmStreams:
         published before the bag began, but the recorder received it a little late.
         """
         if not self._bodies:
-            return self._earlier_body_at(time, before)
+            return before
         number = int(np.searchsorted(self._body.times, time, side='right'))
         body = self._bodies[max(number - 1, 0)]
         if number == 0 and not body.offsets.known:
             body = body.with_offsets(before.offsets)
         return before if body == before else body
-
-    def _earlier_body_at(self, time: float, before: BodyState) -> BodyState:
-        """Return the body state from the two topics of a recording of an earlier version.
-
-        Arguments and result are as in `_body_at`.
-        """
-        body, isolated, offsets = before, self._isolated, self._offsets
-        if isolated.values:
-            newest = isolated.values[_latched(isolated.times, time)]
-            body = body.with_isolated(np.flatnonzero(newest))
-        if offsets.values:
-            number = int(np.searchsorted(offsets.times, time, side='right'))
-            known = LengthOffsets(*offsets.values[max(number - 1, 0)])
-            if (number or known.known) and known != body.offsets:
-                body = body.with_offsets(known)
-        return body
 
 
 #: suspect the recording of another robot if messages are rejected for one of these reasons
@@ -262,9 +228,6 @@ CHECK_DRIVER = (
     'if this robot was recorded, correct what the driver publishes (check_driver names the fault), '
     'and record again; otherwise choose the robot that was recorded'
 )
-#: read these topics, which contain the body state, before all others: the recorder may have
-#: received a body state only after the first readings to which it applies
-BODY_TOPICS = 'body_state', *EARLIER
 ISOLATED_ROW = 3  # read from this row of a body state which muscles are isolated
 
 
@@ -310,7 +273,9 @@ def read_streams(
         if name in recorded:
             takers[recorded[name]][labels[name]] = stream.take
     messages = TimedMessages(bag, takers, stop)
-    early = [recorded[name] for name in BODY_TOPICS if name in recorded]
+    # Read body states before all other messages: the recorder may have received a body state only
+    # after the first readings to which it applies.
+    early = [recorded['body_state']] if 'body_state' in recorded else []
     _deliver(messages, takers, early, reception, progress, stop)
     # A topic of motors that also counts as joint_states need not contain joint angles, because the
     # joints may have no sensors.

@@ -26,11 +26,6 @@ DEFAULT, ALL = 'default', 'all'  # values of `--topics` that select several topi
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])  # the interface, by relative name
 SENT = [name for name, topic in TOPICS.items() if topic.sent]  # replay these topics by default
-#: read these topics instead of `body_state` from recordings of earlier versions
-EARLIER = {
-    'isolated_muscles': Topic('std_msgs/msg/String', latched=True),
-    'muscle_length_zeros': Topic(ARRAY, latched=True),
-}
 
 
 def topics_with(motors: MotorTopics) -> dict[str, Topic]:
@@ -49,8 +44,8 @@ def interface_topics(
 ) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
-    The topics of `EARLIER` are included. If a ros2_control robot has a topic for its motor states,
-    this topic is returned as `muscle_states`.
+    If a ros2_control robot has a topic for its motor states, this topic is returned as
+    `muscle_states`.
 
     Args:
         bag: The recording.
@@ -62,7 +57,7 @@ def interface_topics(
             missing, or if a topic has another type than in the interface.
     """
     names = _relative_names(bag, namespace, motors)
-    topics = topics_with(motors) | EARLIER
+    topics = topics_with(motors)
     ours = {relative: name for name, relative in names.items() if relative in topics}
     for relative, name in ours.items():
         _compare_type(bag, name, topics[relative].type)
@@ -73,7 +68,7 @@ def interface_topics(
         recorded = ours['muscle_states'] = ours[state_topic]
         if interface_name(recorded) == 'joint_states':
             ours.setdefault('joint_states', recorded)
-    return {name: recorded for name, recorded in ours.items() if name in TOPICS | EARLIER}
+    return {name: recorded for name, recorded in ours.items() if name in TOPICS}
 
 
 def select(

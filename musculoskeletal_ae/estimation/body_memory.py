@@ -25,7 +25,13 @@ import numpy as np
 
 from musculoskeletal_ae.estimation.detectors.joint_sensor_trust import SensorDoubt
 from musculoskeletal_ae.remembered_text import RememberedText
-from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import (
+    MOST_OFFSET,
+    UNKNOWN,
+    BodyState,
+    LengthOffsets,
+    Trust,
+)
 
 FILE = 'estimator.offsets'  # name of the file, in the directory that the user chooses
 LOST = (
@@ -79,7 +85,6 @@ class BodyMemory:
         The doubts that it states become `doubts`. If the text is damaged, all length offsets are
         unknown, and no muscle is isolated.
         """
-        unknown = LengthOffsets.unknown(len(self._muscles))
         with suppress(ValueError, TypeError, KeyError, AttributeError):
             content = json.loads(text)
             names, generation = content.get('isolated', []), int(content['generation'])
@@ -93,9 +98,9 @@ class BodyMemory:
                 return BodyState(known, isolated, generation=generation)
             offset = np.array([float(saved.get(name, 0.0)) for name in self._muscles])
             if (np.abs(offset) <= MOST_OFFSET).all() and generation >= 0:
-                offsets = LengthOffsets(offset, unknown.deviation)
+                offsets = LengthOffsets.of(offset, UNKNOWN, Trust.UNKNOWN)
                 return BodyState(offsets, isolated, generation=generation)
-        return BodyState(unknown)
+        return BodyState(LengthOffsets.unknown(len(self._muscles)))
 
     def note(self, body: BodyState, doubts: Mapping[int, SensorDoubt] | None = None) -> None:
         """Note what the next estimator has to know, and save it if it has changed.

@@ -48,7 +48,7 @@ from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import UNKNOWN, Anomaly, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
@@ -228,9 +228,8 @@ class Estimator:
             evidence: Why the offsets are unknown.
             offset: Offsets that are used meanwhile [m], (M,); 0 by default.
         """
-        unknown = LengthOffsets.unknown(self.robot.muscle_count)
-        offset = unknown.offset if offset is None else offset
-        self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
+        offset = np.zeros(self.robot.muscle_count) if offset is None else offset
+        self._note(evidence, found=LengthOffsets.of(offset, UNKNOWN))
 
     def _new_calibration(self, posture: tuple[float, ...], reason: str = '') -> LengthCalibration:
         """Return a calibration of the offsets that are not certain, or of all if all are certain.

@@ -22,10 +22,7 @@ Values = tuple[float, ...]  # an array of numbers, as it is saved
 
 
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
-    """One `Sample` with its number and the muscles that it describes, as in `StoredSample`.
-
-    In states of earlier versions, two more values follow, which are not read.
-    """
+    """One `Sample` with its number and the muscles that it describes, as in `StoredSample`."""
 
     number: int
     theta: Values

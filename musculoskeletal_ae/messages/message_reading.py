@@ -180,11 +180,6 @@ def joint_names(message: Any) -> list[str]:
     return names
 
 
-def read_names(message: Any) -> list[str]:
-    """Return the names in a String, which are separated by commas and stripped of spaces."""
-    return [name for part in message.data.split(',') if (name := part.strip())]
-
-
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
     """Return the link that carries an IMU, and the acceleration [m/s²], (3,), of an Imu message.
 

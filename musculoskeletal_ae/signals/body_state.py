@@ -10,7 +10,7 @@ message, they assume a healthy body.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 
@@ -19,9 +19,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MessageError
 
-#: Give an offset that nothing has determined this standard deviation [m]. Offsets that are
-#: constructed without a trust are known if their standard deviation is smaller.
-UNKNOWN = 1.0
+UNKNOWN = 1.0  # give an offset that nothing has determined this standard deviation [m]
 MOST_OFFSET = 10.0  # reject a body state with a larger offset of a length sensor than this [m]
 ROWS = 6  # expect this many rows in a message on `body_state` (`BodyState.of_rows`)
 
@@ -68,23 +66,25 @@ class LengthOffsets:
 
     offset: Array
     deviation: Array
-    trust: Ints = field(default_factory=lambda: np.zeros(0, dtype=int))
+    trust: Ints
 
-    def __post_init__(self) -> None:
-        """Set a missing trust from the standard deviations: offsets below UNKNOWN are known."""
-        if len(self.trust) != len(self.offset):
-            is_known = self.deviation < UNKNOWN
-            object.__setattr__(self, 'trust', np.where(is_known, Trust.KNOWN, Trust.UNKNOWN))
+    @classmethod
+    def of(
+        cls, offset: Array, deviation: Array | float, trust: Trust = Trust.KNOWN
+    ) -> LengthOffsets:
+        """Return offsets [m], (M,), that are trusted equally; `deviation` [m] may be a number."""
+        shape = offset.shape
+        return cls(offset, np.broadcast_to(deviation, shape), np.full(shape, trust, dtype=int))
 
     @classmethod
     def none(cls, muscle_count: int) -> LengthOffsets:
         """Return no offsets: all are 0 and exactly known, as with absolute sensors."""
-        return cls(np.zeros(muscle_count), np.zeros(muscle_count))
+        return cls.of(np.zeros(muscle_count), 0.0)
 
     @classmethod
     def unknown(cls, muscle_count: int) -> LengthOffsets:
         """Return unknown offsets: they are 0 until something determines them."""
-        return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
+        return cls.of(np.zeros(muscle_count), UNKNOWN, Trust.UNKNOWN)
 
     def __eq__(self, other: object) -> bool:
         """Return whether all offsets, standard deviations and trusts are equal."""

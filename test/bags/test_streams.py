@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from robots import with_modules
 
 from bags import bag_samples as samples
-from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
+from bags.arm_bag import ARRAY, JOINTS, Arm, array, joints
 from musculoskeletal_ae.bags.check import check_bag, motion_text
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.recorded_faults import find_faults
@@ -88,25 +88,12 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     assert_array_equal(result.joints.values[1], arm.theta[0])
 
 
-def body_message(form, body):
-    """Return topic and content of a message of a body state, as this or an earlier version does."""
-    rows = body.rows
-    if form == 'this version':
-        return '/body_state', array(rows)
-    known = rows[:2] if form == 'version 0.1.0' else rows[[0, 1, 2, 5]]
-    return '/muscle_length_zeros', array(known)
-
-
-FORMS = 'this version', 'later than 0.1.0', 'version 0.1.0'
-
-
-@pytest.mark.parametrize('form', FORMS)
-def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robot, tmp_path, form):
+def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robot, tmp_path):
     offset = np.linspace(-0.08, 0.08, robot.muscle_count)
-    sought, found = LengthOffsets.unknown(len(offset)), LengthOffsets(offset, 0.0 * offset)
+    sought, found = LengthOffsets.unknown(len(offset)), LengthOffsets.of(offset, 0.0)
     for generation, (at, offsets) in enumerate([(0.5, sought), (1.0, found)], 1):
-        topic, content = body_message(form, BodyState(offsets, generation=generation))
-        arm.add(topic, ARRAY, at - 0.001, content)
+        body = BodyState(offsets, generation=generation)
+        arm.add('/body_state', ARRAY, at - 0.001, array(body.rows))
     result = streams(arm, robot, tmp_path)
     assert result.rejected == {'/muscle_states: length offsets unknown': 50}
     assert_allclose(result.muscle_times, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
@@ -114,33 +101,27 @@ def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robo
     assert_allclose(result.muscles.length[50:], arm.length[100:] - offset)
 
 
-@pytest.mark.parametrize('form', FORMS)
-def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_path, form):
-    offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
-    topic, content = body_message(form, BodyState(LengthOffsets(offset, surely), generation=1))
-    arm.add(topic, ARRAY, 0.501, content)
+def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_path):
+    offset = np.linspace(-0.08, 0.08, robot.muscle_count)
+    body = BodyState(LengthOffsets.of(offset, 1e-3), generation=1)
+    arm.add('/body_state', ARRAY, 0.501, array(body.rows))
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
     assert_allclose(result.muscles.length, arm.length - offset)
 
 
-@pytest.mark.parametrize('is_earlier', [False, True])
-def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path, is_earlier):
-    count, (first, second) = robot.muscle_count, robot.muscles[:2]
+def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path):
+    count = robot.muscle_count
     for i in range(0, len(arm.content), 2):
         lost = 0 if i < 200 else 1
         rows = [arm.length[i // 2], arm.tension[i // 2].copy(), np.full(count, 30.0)]
         rows[1][lost] = np.nan
         arm.content[i] = arm.content[i]._replace(data=array(rows))
     # The first message arrives after the first muscle states, as a latched message may.
-    if is_earlier:
-        arm.add('/isolated_muscles', STRING, 0.501, string(first))
-        arm.add('/isolated_muscles', STRING, 0.999, string(second))
-    else:
-        healthy = BodyState.healthy(count)
-        for muscle, at in ((0, 0.501), (1, 0.999)):
-            body = replace(healthy, isolated=(muscle,), generation=muscle + 1)
-            arm.add('/body_state', ARRAY, at, array(body.rows))
+    healthy = BodyState.healthy(count)
+    for muscle, at in ((0, 0.501), (1, 0.999)):
+        body = replace(healthy, isolated=(muscle,), generation=muscle + 1)
+        arm.add('/body_state', ARRAY, at, array(body.rows))
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
     pairs = result.pairs()

@@ -47,7 +47,7 @@ class Arm(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.arm, self.now, self.blind = EmulatedArm(ROBOT, 1), 100.0, set()
-        self.offsets = LengthOffsets(np.zeros(COUNT), np.zeros(COUNT))
+        self.offsets = LengthOffsets.of(np.zeros(COUNT), np.zeros(COUNT))
         self.restart(False)
 
     @rule(explores=st.booleans())
@@ -158,7 +158,7 @@ class Arm(RuleBasedStateMachine):
         """Use other length offsets, as after a length calibration."""
         offset = self.offsets.offset.copy()
         offset[muscle] += by
-        self.offsets = LengthOffsets(offset, np.zeros(COUNT))
+        self.offsets = LengthOffsets.of(offset, np.zeros(COUNT))
         if not known:
             self.offsets = LengthOffsets.unknown(COUNT)
         self.core.use_body(self.core.stream.body.with_offsets(self.offsets))

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench
+from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.followed_goal import (
@@ -19,6 +20,7 @@ from musculoskeletal_ae.control.followed_goal import (
 from musculoskeletal_ae.control.settings import METHODS
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
+from musculoskeletal_ae.robot.robot import Robot
 
 FREE = np.full(2, np.inf)
 TIGHT = np.array([0.05, np.inf])
@@ -150,3 +152,13 @@ def test_tolerances_of_unknown_joints_or_not_finite_are_refused_and_zero_means_n
         read_tolerances([one(0.1, 'no_joint')], ROBOT.units)
     with pytest.raises(MessageError, match='not finite'):
         read_tolerances([one(np.nan)], ROBOT.units)
+
+
+def test_the_tolerance_of_a_prismatic_joint_is_in_metres(tmp_path):
+    units = Robot.load(write_robot(tmp_path, slider=True)).units
+    tolerance = SimpleNamespace(name=units.names[-1], position=0.002, velocity=0.0)
+    bounds = read_tolerances([tolerance], units)
+    slider = np.eye(len(units))[-1]
+    at, within, beyond = (units.to_theta((0.03 + off) * slider) for off in (0.0, 0.0019, 0.0021))
+    assert (np.abs(within - at) <= bounds).all()
+    assert not (np.abs(beyond - at) <= bounds).all()

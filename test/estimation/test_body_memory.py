@@ -14,7 +14,7 @@ from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthT
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 
 MUSCLES, JOINTS = ['biceps', 'triceps'], ['shoulder', 'elbow']
-OFFSETS = LengthOffsets(np.array([0.05, -0.08]), np.full(2, 1e-3))
+OFFSETS = LengthOffsets.of(np.array([0.05, -0.08]), np.full(2, 1e-3))
 FOUND = BodyState(OFFSETS, (1,), generation=12)
 HEALTHY = BodyState.healthy(2)
 

@@ -15,7 +15,7 @@ from musculoskeletal_ae.estimation.lengths.length_trust import (
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 M = 4
-FOUND = LengthOffsets(np.linspace(-0.08, 0.08, M), np.full(M, 1e-3))
+FOUND = LengthOffsets.of(np.linspace(-0.08, 0.08, M), np.full(M, 1e-3))
 REVOKING = [kind for kind in ConditionKind if kind.revokes is not None]
 TAKEN = [evidence for evidence in Evidence if evidence is not Evidence.ASSUMED] + REVOKING
 CALIBRATIONS = {*UNSURE, Evidence.CALIBRATED}
@@ -82,7 +82,7 @@ def test_an_offset_that_moved_in_a_repair_stays_known_until_the_next_calibration
 @pytest.mark.parametrize('evidence', [Evidence.RESTARTED, Evidence.NOT_CALIBRATED])
 def test_offsets_that_are_unknown_at_the_start_stay_unknown_until_a_calibration(evidence):
     trust = LengthTrust(M)
-    trust.take(evidence, found=LengthOffsets(FOUND.offset, np.ones(M)))
+    trust.take(evidence, found=LengthOffsets.of(FOUND.offset, np.ones(M)))
     for other in (ConditionKind.LENGTH_JUMP, Evidence.MOVED):
         trust.take(other)
         assert trust.offsets.not_known == tuple(range(M))

@@ -295,7 +295,7 @@ def test_a_sample_describes_the_muscles_that_were_not_isolated_when_it_was_taken
     (isolated,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=80.0)
     assert np.flatnonzero(~stored[-1].known).tolist() == [2]
     assert isolated.length[2] == isolated.tension[2] == 0.0
-    offsets = LengthOffsets(np.full(6, 0.003), np.zeros(6))
+    offsets = LengthOffsets.of(np.full(6, 0.003), np.zeros(6))
     body = body.with_isolated([]).with_offsets(offsets)
     collector.use_body(body)
     (moved,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=100.0)

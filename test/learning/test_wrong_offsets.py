@@ -41,7 +41,8 @@ def arm(learner, stage):
 
 
 def use(learner, offset, known=True):
-    offsets = LengthOffsets(np.asarray(offset, dtype=float), np.full(6, 0.001 if known else 1.0))
+    trust = Trust.KNOWN if known else Trust.UNKNOWN
+    offsets = LengthOffsets.of(np.asarray(offset, dtype=float), 0.001, trust)
     learner.use_body(learner.body.with_offsets(offsets))
 
 

@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout, String
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.exceptions import MessageError
@@ -19,7 +19,6 @@ from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
     read_array,
     read_imu,
-    read_names,
     read_pose,
     read_posture,
     read_target,
@@ -57,11 +56,6 @@ def test_what_is_written_is_read(rows, columns):
 
 def test_an_array_without_layout_is_accepted_by_its_length():
     assert read_array(muscle_array([1.0, 2.0]), 1, 2).tolist() == [1.0, 2.0]
-
-
-def test_names_have_commas_between_and_may_have_spaces_within():
-    assert read_names(String(data='biceps long, triceps ,')) == ['biceps long', 'triceps']
-    assert read_names(String(data='')) == []
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ class Loop:
 
     def know(self, offset):
         """Give the controller the length offsets [m], (M,), as at the end of a calibration."""
-        offsets = LengthOffsets(offset, np.zeros(len(offset)))
+        offsets = LengthOffsets.of(offset, np.zeros(len(offset)))
         self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def sent(self, command):

@@ -135,7 +135,7 @@ def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
 
 def strange_body(count):
     """Return a body state in which everything is wrong: offsets, isolated muscles and anomaly."""
-    offsets = LengthOffsets(np.full(count, 0.08), np.full(count, 1e-3))
+    offsets = LengthOffsets.of(np.full(count, 0.08), np.full(count, 1e-3))
     body = BodyState(offsets, (1, 2), Anomaly.VERIFYING, 1, generation=99)
     return array_message(body.rows, 'quantity', 'muscle')
 

@@ -92,7 +92,7 @@ def test_every_decision_of_the_estimator_is_used_once_and_as_it_states(graph, tr
 def test_commanded_lengths_are_corrected_by_the_same_offsets_as_measured_ones(graph, monkeypatch):
     core, noted = graph.host(EstimatorNode, robot='arm26').core, []
     monkeypatch.setattr(core, 'commanded', lambda _, length: noted.append(length))
-    core.body = core.body.with_offsets(LengthOffsets(np.full(6, 0.05), np.full(6, 1e-3)))
+    core.body = core.body.with_offsets(LengthOffsets.of(np.full(6, 0.05), np.full(6, 1e-3)))
     publisher = graph.publisher(Float64MultiArray, 'muscle_length_command')
 
     def is_noted():

@@ -50,7 +50,7 @@ def resting(**changes):
 
 def test_a_sound_message_becomes_a_sample_with_the_length_offset_removed():
     offset = np.linspace(-0.08, 0.08, M)
-    body = HEALTHY.with_offsets(LengthOffsets(offset, np.zeros(M)))
+    body = HEALTHY.with_offsets(LengthOffsets.of(offset, np.zeros(M)))
     stream, states = MuscleStream(ROBOT, body), resting()
     states[0] += offset
     sample = stream.take(message(states), 1.5)

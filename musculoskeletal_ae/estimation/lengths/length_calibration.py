@@ -34,7 +34,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import MOST_OFFSET, UNKNOWN, LengthOffsets
+from musculoskeletal_ae.signals.body_state import MOST_OFFSET, UNKNOWN, LengthOffsets, Trust
 from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 
 ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
@@ -305,7 +305,7 @@ class LengthCalibration:
         error = used * (moments.length - offset - expected)
         residual = np.median(np.abs(error), axis=0)
         self._best = fit
-        deviation = np.full(muscle_count, UNKNOWN)
+        deviation, trust = np.full(muscle_count, UNKNOWN), Trust.UNKNOWN
         if is_enough:
             self._problem = self._problem_of(fit, residual)
             self.contradicts_known = self._contradicts_known(error)
@@ -313,7 +313,8 @@ class LengthCalibration:
                 independent = max(1.0, len(fit.theta) / CORRELATED)
                 deviation = MAD_TO_DEVIATION * residual / np.sqrt(independent)
                 deviation[~used] = LARGEST_RESIDUAL
-        self._estimate = LengthOffsets(offset, deviation)
+                trust = Trust.KNOWN
+        self._estimate = LengthOffsets.of(offset, deviation, trust)
 
     def _impossible_offset(self, offset: Array) -> str:
         """Return for users which offset is too large to be used, or '' if none is."""
