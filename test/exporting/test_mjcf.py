@@ -193,6 +193,22 @@ def test_a_muscle_keeps_points_if_learned_ones_are_worse_or_make_its_length_jump
     assert np.all(found.after.arms <= found.before.arms)
 
 
+@pytest.mark.parametrize('worse', learned_routes.Errors._fields)
+def test_learned_points_must_be_closer_in_lengths_and_in_moment_arms(learned, monkeypatch, worse):
+    robot, _, mae, _ = learned
+    body, ones = CalibratedBody(robot), np.ones(robot.muscle_count)
+    fit_to_network(body, mae, with_remainder=False)
+    before, half = learned_routes.Errors(ones, ones), 0.5 * ones
+    of_first = np.where(np.arange(robot.muscle_count) == 0, 2.0, 0.5)
+    after = learned_routes.Errors(half, half)._replace(**{worse: of_first})
+    monkeypatch.setattr(
+        learned_routes, 'errors', lambda moved, *_: before if moved is robot else after
+    )
+    monkeypatch.setattr(learned_routes, 'newly_jumping', lambda *_: ones < 0.0)
+    found = learned_routes.learned_routes(robot, body, mae)
+    assert found.kept == {robot.muscles[0]: 'learned points are not closer to the network'}
+
+
 def test_a_muscle_keeps_its_points_if_samples_leave_open_how_it_differs(learned):
     robot, _, mae, _ = learned
     body = CalibratedBody(robot)

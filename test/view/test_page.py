@@ -12,6 +12,7 @@ from queue import SimpleQueue
 from threading import Thread
 from types import SimpleNamespace
 from typing import Any
+from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import numpy as np
@@ -612,6 +613,10 @@ def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(arm26)
         for origin in foreign:
             with pytest.raises(InvalidStatus, match='403'):
                 visit(port, origin)
+        # A site whose domain name resolves to this machine names itself as the host, too.
+        headers = {'Host': f'evil.example:{port}', 'Origin': f'http://evil.example:{port}'}
+        with pytest.raises(HTTPError, match='403'):
+            urlopen(Request(f'http://127.0.0.1:{port}/', headers=headers), timeout=60)
         with visit(port, f'http://localhost:{port}') as mine:
             assert mine.recv(timeout=300)
         named = f'cannot serve the page at port {port} of 127.0.0.1: Address already in use'
