@@ -4,7 +4,7 @@
 import heapq
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, NamedTuple
@@ -49,7 +49,9 @@ class Pairs(NamedTuple):
     theta: Array  # joint angles [rad], (P, D); NaN for joints without a usable reading
     length: Array  # muscle lengths [m], (P, M)
     tension: Array  # tensions [N], (P, M)
-    isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
+    #: 1 for muscles that were isolated or suspected of a fault, 0 for others, -1 if not recorded,
+    #: (P, M)
+    isolated: Ints
 
     def at(self, rows: Ints | Bools | slice) -> 'Pairs':
         """Return the pairs in the rows that indices, a mask or a slice select."""
@@ -63,7 +65,7 @@ class Streams(NamedTuple):
     joints: Series  # usable joint angles [rad], (N, D); NaN where a joint has no usable reading
     muscle_times: Array  # times of the readings of muscle modules since the bag's start [s], (N,)
     muscles: MuscleReadings  # the N readings, with corrected lengths and plausible temperatures
-    isolated: Series  # 1 for isolated muscles, else 0, (N, M)
+    isolated: Series  # 1 for muscles that are isolated or suspected of a fault, else 0, (N, M)
     rejected: Counter[str]  # rejected messages by topic and reason
     ignored: Counter[str]  # unused parts of messages by topic and part
     notes: tuple[str, ...]  # further remarks for the user
@@ -201,9 +203,26 @@ class _ArmStreams:
         return body.rows
 
     def isolated(self) -> Series:
-        """Return the isolated muscles in each message that states them, as 1, others as 0."""
-        time, rows = self._body.series()
-        return Series(time, rows[:, ISOLATED_ROW])
+        """Return, for each body state, 1 for muscles that cannot be relied on, and 0 for others.
+
+        These are the isolated muscles, and the suspect while its anomaly is present.
+        """
+        unreliable = [~body.used | body.suspected for body in self._bodies]
+        shape = -1, self._robot.muscle_count
+        return Series(np.array(self._body.times), np.array(unreliable, dtype=int).reshape(shape))
+
+    @property
+    def finding_notes(self) -> Iterator[str]:
+        """A remark for the user on each fault of a muscle that the estimator found."""
+        before: Bools = np.zeros(self._robot.muscle_count, dtype=bool)
+        for time, body in zip(self._body.times, self._bodies):
+            for muscle in np.flatnonzero(body.suspected & ~before).tolist():
+                name = self._robot.muscles[muscle]
+                yield (
+                    f'the estimator found a fault of {name} {time:.1f} s after the start; its '
+                    'readings are not used while this fault or its isolation lasts'
+                )
+            before = body.suspected
 
     def _body_at(self, time: float, before: BodyState) -> BodyState:
         """Return the body state at a time [s] of the recording; `before` if nothing has changed.
@@ -228,7 +247,6 @@ CHECK_DRIVER = (
     'if this robot was recorded, correct what the driver publishes (check_driver names the fault), '
     'and record again; otherwise choose the robot that was recorded'
 )
-ISOLATED_ROW = 3  # read from this row of a body state which muscles are isolated
 
 
 def read_streams(
@@ -281,7 +299,7 @@ def read_streams(
     # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
-    notes = tuple(filter(None, (messages.note, arm.tension_note)))
+    notes = tuple(filter(None, (messages.note, arm.tension_note, *arm.finding_notes)))
     joints, states = (arm.by_topic[name].series() for name in ('joint_states', 'muscle_states'))
     is_known = np.array(arm.had_offsets, dtype=bool)
     if not is_known.all():

@@ -178,6 +178,11 @@ class BodyState:
         """Which muscles are not isolated, (M,)."""
         return ~np.isin(np.arange(self.muscle_count), self.isolated)
 
+    @cached_property
+    def suspected(self) -> Bools:
+        """Which muscle is the suspect of a present anomaly, (M,)."""
+        return self.has_anomaly & (np.arange(self.muscle_count) == self.suspect)
+
     @property
     def has_anomaly(self) -> bool:
         """Whether an anomaly is present. If so, the arm is stopped."""

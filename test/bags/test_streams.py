@@ -14,7 +14,7 @@ from musculoskeletal_ae.bags.recorded_faults import find_faults
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 
 @pytest.fixture(scope='module')
@@ -131,6 +131,26 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
     swapped = pairs._replace(length=pairs.length[:, [1, 0, *range(2, count)]])
     # Muscles that were isolated at any time are not compared, so no column counts as misplaced.
     assert not find_faults(robot, swapped).wiring.faulty
+
+
+def test_a_muscle_in_which_the_estimator_found_a_fault_does_not_count(arm, robot, tmp_path):
+    """Otherwise `replay --check` says of a ruptured muscle that its length has the wrong sign."""
+    count = robot.muscle_count
+    arm.length[20:, 1] = 2.0 * arm.length[20, 1] - arm.length[20:, 1]  # it goes the wrong way
+    for i in range(40, len(arm.content), 2):
+        rows = [arm.length[i // 2], arm.tension[i // 2], np.full(count, 30.0)]
+        arm.content[i] = arm.content[i]._replace(data=array(rows))
+    assert find_faults(robot, streams(arm, robot, tmp_path).pairs()).wiring.faulty
+    healthy = BodyState.healthy(count)
+    for n, body in enumerate((healthy, healthy.with_anomaly(Anomaly.FOUND, 1))):
+        rows = replace(body, generation=n + 1).rows
+        arm.add('/body_state', ARRAY, 0.501 + 0.497 * n, array(rows))
+    result = read_streams(Bag.open(arm.write(tmp_path / 'with_state')), robot)
+    pairs = result.pairs()
+    assert_array_equal(pairs.isolated[:, :3], [[0, 0, 0]] * 100 + [[0, 1, 0]] * 100)
+    assert not find_faults(robot, pairs).wiring.faulty
+    (note,) = result.notes
+    assert f'fault of {robot.muscles[1]} 1.0 s after the start' in note
 
 
 def test_isolated_muscles_are_unknown_if_the_bag_does_not_contain_them(arm, robot, tmp_path):

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import ROWS, Anomaly, BodyState
 
 BAGS = Path(__file__).parents[2] / 'bags'
 
@@ -44,16 +46,22 @@ def test_the_recorded_arm_was_moved_by_hand_and_repeated_the_motion():
 
 def test_the_recorded_arm_lost_a_muscle_moved_on_and_used_it_again():
     bag = Bag.open(BAGS / 'isolation')
-    at, names = series(bag, '/isolated_muscles')
-    assert [message.data for message in names] == ['', 'deltoid_middle', '']
-    noticed, detected = series(bag, '/anomaly_detected')
-    assert [message.data for message in detected] == [False, True, False]
+    at, messages = series(bag, '/body_state')
+    rows = [np.reshape(message.data, (ROWS, -1)) for message in messages]
+    bodies = [BodyState.of_rows(each) for each in rows]
+    muscle = Robot.load('musashi_left_arm').muscles.index('deltoid_middle')
+    isolated = [body.isolated for body in bodies]
+    assert set(isolated) == {(), (muscle,)}
+    lost = at[isolated.index((muscle,))]
+    used_again = at[next(n for n in range(len(at)) if at[n] > lost and not isolated[n])]
+    ended = at[next(n for n, body in enumerate(bodies) if body.anomaly is Anomaly.ENDED)]
+    assert lost < ended < used_again
     times, states = series(bag, '/muscle_states')
-    tension = np.array([message.data[10] for message in states])  # T of the first muscle [N]
-    assert (tension[(times > at[1]) & (times < noticed[2])] < 3.0).all()
-    assert tension[times > at[2]].max() > 100.0
+    tension = np.array([message.data[10 + muscle] for message in states])  # [N]
+    assert (tension[(times > lost) & (times < ended)] < 3.0).all()
+    assert tension[times > used_again].max() > 100.0
     (sent,), (target,) = series(bag, '/target_joint_states')
-    assert noticed[2] < sent < at[2]
+    assert ended < sent < used_again
     times, states = series(bag, '/joint_states')
     where = np.array([state.position for state in states])[np.searchsorted(times, sent + 8.0)]
     # The arm misses the target a little, because its network knows the geometric model only.
