@@ -3,15 +3,15 @@
 
     τ_ext = M(θ) θ̈ + h(θ, θ̇) + Gᵀ T_end,   T_end = T e^{−μ s}
     F     = argmin Σ_j ((JᵀF − τ_ext)_j / σ_j)² + ‖F‖²/F₀²,   without a moment at the hand
-    d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > CONTACT in IN_A_ROW consecutive messages
+    d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > d_max in IN_A_ROW consecutive messages
 
 τ_ext is the external torque at the joints, F the force at the hand, and d the evidence for contact.
 M is the inertia matrix, G the muscle Jacobian ∂l/∂θ, and J the Jacobian of the hand. h contains the
 torques due to velocity and weight, and those of the joints' springs and dampers. The bone-side
 tension T_end follows from the measured tension T, tendon friction μ, and the direction s in which a
-tendon slid last (`signals/friction.py`). σ is the residual torque of the healthy moving arm
-(`estimation/healthy_torque.py`). The term with F₀ limits components of F that produce no joint
-torque, such as the component along a stretched arm.
+tendon slid last (`signals/friction.py`). σ is the residual torque of the healthy moving arm, and
+d_max is what its d exceeds about once in 10 h (`estimation/healthy_torque.py`). The term with F₀
+limits components of F that produce no joint torque, such as the component along a stretched arm.
 
 θ and Gᵀ T_end pass through the same second-order low-pass filter, which also yields θ̇ and θ̈. The
 result is the residual of the momentum observer (De Luca 2005), without numerical differentiation
@@ -45,10 +45,7 @@ AT_STOP = 0.06
 #: evaluate the muscle Jacobian G again once a joint has moved by this much [rad], not at every
 #: message, because G changes slowly
 TURNED = 0.02
-#: report contact if the evidence d exceeds this; on five healthy arms that explored for ten minutes
-#: each without contact, d was at most 8.6
-CONTACT = 10.0
-IN_A_ROW = 2  # report contact once the evidence exceeds CONTACT in this many consecutive messages
+IN_A_ROW = 2  # report contact once d exceeds d_max in this many consecutive messages
 
 
 class Contact(NamedTuple):
@@ -62,7 +59,8 @@ class Contact(NamedTuple):
             force.
         distance: Root sum square of the torques, each divided by its standard deviation on the
             healthy arm; NaN if this deviation is not calibrated, or if a reading is not finite.
-        is_contact: Whether `distance` has exceeded CONTACT in two consecutive messages (IN_A_ROW).
+        is_contact: Whether `distance` has exceeded its threshold in two consecutive messages
+            (IN_A_ROW).
     """
 
     torque: Array
@@ -113,8 +111,8 @@ class ContactEstimator:
     Attributes:
         velocity: Filtered joint velocities θ̇ [rad/s], (D,).
         damping: Damping of the joints in the network [N·m·s/rad], (D,).
-        is_calibrated: Whether the residual torque of the healthy arm has been calibrated. Contacts
-            are detected only then.
+        threshold: Report contact if the evidence d exceeds this (d_max); ∞ until the arm has moved
+            enough without contact.
         count: Number of contacts detected so far.
     """
 
@@ -123,14 +121,15 @@ class ContactEstimator:
         self._middle = 0.5 * (robot.lower + robot.upper)
         self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP
         self._filter = LowPass(BANDWIDTH)
-        self.is_calibrated = False
+        self.threshold = math.inf
+        self._is_calibrated = False
         self.count = 0
         self.reset()
 
     def use(self, mae: Mae) -> None:
         """Use another network, and its joint springs, dampers and residual torque σ (`mae.touch`).
 
-        Without a calibrated σ, external torques are estimated, but no contact is reported.
+        Without calibrated statistics, external torques are estimated, but no contact is reported.
         """
         joint_count, healthy = self._robot.joint_count, mae.touch
         self._robot = self._robot.with_elasticity(mae.elasticity)
@@ -138,15 +137,17 @@ class ContactEstimator:
         self._mae = mae
         self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated last
         self._weight = np.ones(joint_count)  # 1/σ², (D,); 1 without a calibrated σ
-        self.is_calibrated = healthy is not None and healthy.calibrated
-        if healthy is not None and self.is_calibrated:
+        self.threshold = math.inf
+        self._is_calibrated = healthy is not None and healthy.calibrated
+        if healthy is not None and self._is_calibrated:
             self._weight = 1.0 / healthy.spread**2
+            self.threshold = healthy.peaks.threshold
 
     def reset(self) -> None:
         """Reset the filter, for example after a jump of the clock."""
         self._filter.reset()
         self.velocity: Array = np.zeros(self._robot.joint_count)
-        self._beyond = 0  # consecutive messages with d > CONTACT
+        self._beyond = 0  # consecutive messages with d > d_max
 
     def step(self, theta: Array, end_tension: Array, dt: float) -> Contact:
         """Step the filter by one message, and return the external load.
@@ -172,9 +173,9 @@ class ContactEstimator:
             self.reset()
             return Contact(np.zeros(joint_count), lambda: np.zeros(3), math.nan, False)
         distance = math.nan
-        if self.is_calibrated:
+        if self._is_calibrated:
             distance = math.sqrt(self._weight @ (torque * torque))
-        self._beyond = self._beyond + 1 if distance > CONTACT else 0
+        self._beyond = self._beyond + 1 if distance > self.threshold else 0
         self.count += self._beyond == IN_A_ROW
         force = partial(self._force, position, torque, self._weight * is_free)
         return Contact(torque, force, distance, self._beyond >= IN_A_ROW)

@@ -555,8 +555,10 @@ class Estimator:
             pull = sample.bone_tension * self.body.used
             self.load = self.contact.step(estimated.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
-                contact, torque = self.contact, self.load.torque
-                self.healthy_torque.step(torque, contact.velocity, contact.damping, sent_apart)
+                contact, load = self.contact, self.load
+                self.healthy_torque.step(
+                    load.torque, contact.velocity, contact.damping, sent_apart, load.distance
+                )
         if known and self.suspects.finding is None:
             self.health.step_healthy(observation, self.load)
             self._follow_joint_trust()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -182,7 +183,7 @@ def _contact(core: Estimator) -> dict[str, str]:
     if contact is None:
         return {}
     count = str(core.contact.count)
-    if not core.contact.is_calibrated:
+    if math.isinf(core.contact.threshold):
         return {'contact': 'not calibrated', 'contacts': count}
     force = f'{np.linalg.norm(contact.force()):.0f} N at the hand'
     return {'contact': force if contact.is_contact else 'none', 'contacts': count}

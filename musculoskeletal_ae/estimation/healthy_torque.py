@@ -11,18 +11,22 @@ square. If the joint is damped more than the estimate assumed (d_j,used), τ_j o
 velocity. The means E are formed like σ_j². t_j is the time of motion in which τ_j was known, and at
 most MEMORY.
 
-`estimation/contact.py` divides the external torque by σ to decide whether there is contact. The
-damping becomes part of the network's `elasticity`, so that contact detection and motion plans
+`estimation/contact.py` divides the external torque by σ, which gives the evidence for contact d.
+The largest d of each period of PERIOD is a peak. Mean and standard deviation of the peaks determine
+how large d has to be to indicate contact (`mae/residuals.py`).
+
+The damping becomes part of the network's `elasticity`, so that contact detection and motion plans
 consider it.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import LEAST_MOTION
+from musculoskeletal_ae.mae.residuals import LEAST_MOTION, LEAST_PEAKS, Peaks
 from musculoskeletal_ae.robot.robot import Robot
 
 MEMORY = 180.0  # average the squared torque over this much time in motion (time constant) [s]
@@ -38,6 +42,11 @@ PUSHED = 1.5
 SLOW = 0.1
 #: average an adopted damping as if it had been measured at about this velocity [rad/s]
 USUAL = 0.3
+PERIOD = 10.0  # find the largest evidence for contact in periods with this much motion [s]
+REMEMBERED = 60  # average over about this many of these peaks (their number as a time constant)
+#: clip a peak to this many standard deviations above the mean of the earlier ones, because a larger
+#: one indicates contact
+PEAK_OUTLIER = 4.0
 LEAST_SPREAD = 1e-3  # store at least this σ in the network [N·m], because torques are divided by it
 
 
@@ -53,6 +62,9 @@ class HealthyTorque:
         self._means = np.zeros((3, robot.joint_count))  # means of τ², θ̇⁴ and θ̇³ τ'
         self._time = np.zeros(robot.joint_count)  # t_j [s]
         self._is_measuring = False
+        #: number of peaks, their mean and the mean of their squares
+        self._number, self._peak, self._peak_square = 0.0, 0.0, 0.0
+        self._period, self._largest = 0.0, 0.0  # time in this period [s], largest d in it
 
     def put_into(self, mae: Mae) -> Mae:
         """Put the measured damping and residual torque σ into a copy of a network; return the copy.
@@ -75,9 +87,11 @@ class HealthyTorque:
             product = (fourth + SLOW**4) * (self._stated.damping - springs.damping)
             self._means = np.array([known.spread**2, fourth, product])
             self._time = np.full_like(known.spread, known.time)
+            self._number, self._peak, spread = known.peaks
+            self._peak_square = self._peak**2 + spread**2
             return mae
         spread = np.maximum(np.sqrt(self._means[0]), LEAST_SPREAD)
-        touch = replace(known, spread=spread, time=float(self._time.max()))
+        touch = replace(known, spread=spread, time=float(self._time.max()), peaks=self.peaks)
         if not touch.calibrated:
             return replace(mae, touch=touch)
         enough = self._time >= LEAST_MOTION
@@ -91,7 +105,20 @@ class HealthyTorque:
             elasticity=replace(springs, damping=damping),
         )
 
-    def step(self, torque: Array, velocity: Array, damping: Array, dt: float) -> None:
+    @property
+    def peaks(self) -> Peaks:
+        """The peaks of the evidence for contact so far."""
+        variance = max(self._peak_square - self._peak**2, 0.0)
+        return Peaks(self._number, self._peak, math.sqrt(variance))
+
+    def step(
+        self,
+        torque: Array,
+        velocity: Array,
+        damping: Array,
+        dt: float,
+        evidence: float = math.nan,
+    ) -> None:
         """Update damping and residual torque with the estimate from one message, if the arm moves.
 
         The arm has to be healthy.
@@ -102,10 +129,12 @@ class HealthyTorque:
             damping: Damping of the joints that this estimate assumed [N·m·s/rad], (D,).
             dt: Time since the previous message [s]. A mean over time does not change in a step of
                 0 s, as between two messages with the same time on /clock.
+            evidence: The evidence for contact d; NaN if it is not known.
         """
         is_moving = dt > 0.0 and np.linalg.norm(velocity) >= MOVING
         if not self._is_measuring or not is_moving:
             return
+        self._step_peak(evidence, dt)
         spread = np.where(self._time > LEAST_MOTION, np.sqrt(self._means[0]), np.inf)
         square = np.minimum(torque**2, (OUTLIER * spread) ** 2)
         clipped = np.clip(torque, -PUSHED * spread, PUSHED * spread)
@@ -118,3 +147,19 @@ class HealthyTorque:
         of_damping = share * (np.abs(torque) <= OUTLIER * spread)
         change = np.array([square, velocity**4, opposed]) - self._means
         self._means = self._means + np.array([share, of_damping, of_damping]) * change
+
+    def _step_peak(self, evidence: float, dt: float) -> None:
+        """Update the largest evidence of the present period; average it when the period ends."""
+        if math.isnan(evidence):
+            return
+        self._period, self._largest = self._period + dt, max(self._largest, evidence)
+        if self._period < PERIOD:
+            return
+        _, mean, spread = self.peaks
+        peak = self._largest
+        if self._number >= LEAST_PEAKS:
+            peak = min(peak, mean + PEAK_OUTLIER * spread)
+        self._number = min(self._number + 1.0, float(REMEMBERED))
+        self._peak += (peak - self._peak) / self._number
+        self._peak_square += (peak**2 - self._peak_square) / self._number
+        self._period = self._largest = 0.0

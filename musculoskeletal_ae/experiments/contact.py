@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure contact estimation and hand guiding, as a part of the experiment `motion`."""
 
+import math
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.estimation.contact import Contact
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, columns
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
@@ -38,6 +41,10 @@ SOON = 0.1  # report the share of collisions that are detected within this time 
 INSIDE = 0.1  # keep random postures away from the joint limits by this fraction of the joint ranges
 
 
+#: what is estimated while lengths are unknown
+NOTHING = Contact(np.zeros(0), lambda: np.zeros(3), math.nan, False)
+
+
 class ContactLoop(ClosedLoop):
     """A closed loop whose arm is pushed."""
 
@@ -47,16 +54,21 @@ class ContactLoop(ClosedLoop):
         If `exploring`, the arm explores for this message; otherwise, it continues as before.
         """
         _ = self.explore() if exploring else self.step()
-        assert self.estimator.output is not None and self.estimator.output.contact is not None
-        return self.estimator.output.contact
+        output = self.estimator.output
+        if output is None or output.contact is None:  # a push has led to a finding about lengths
+            return NOTHING
+        return output.contact
 
     def contacts_during(self, duration: float, exploring: bool = False) -> list[Contact]:
         """Advance by `duration` [s]; return the contact estimate of each message."""
         return [self.contact(exploring) for _ in range(round(duration / SAMPLE_TIME))]
 
     def rest(self, theta: Array) -> None:
-        """End the push, reset the controller, which may have stopped, and move to θ [rad] (D,)."""
+        """End the push, end a stop that it may have caused, and move to θ [rad] (D,)."""
         self.push(np.zeros(3))
+        if self.estimator.body.has_anomaly:
+            with suppress(MusculoskeletalError):
+                self.estimator.reset()
         self.core.reset(self.time)
         self.target(theta)
         self.contacts_during(MOVE)

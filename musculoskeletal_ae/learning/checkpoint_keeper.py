@@ -252,7 +252,7 @@ def _with_measurements_of(measured: Mae | None, mae: Mae) -> Mae:
     known = measured.touch
     if known.time == mae.touch.time and np.array_equal(known.spread, mae.touch.spread):
         return mae
-    mae = replace(mae, touch=replace(mae.touch, spread=known.spread, time=known.time))
+    mae = replace(mae, touch=mae.touch.with_measurements_of(known))
     if (damped := measured.elasticity) is None:
         return mae
     return replace(mae, elasticity=replace(mae.elasticity or damped, damping=damped.damping))

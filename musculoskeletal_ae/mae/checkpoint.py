@@ -22,7 +22,12 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
+from musculoskeletal_ae.mae.residuals import (
+    NO_PEAKS,
+    AnomalyStatistics,
+    Peaks,
+    TouchStatistics,
+)
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
 from musculoskeletal_ae.presets.preset import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
@@ -55,6 +60,7 @@ LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
 Count = Annotated[int, Meta(ge=0, le=2**53)]  # a whole number that JSON represents exactly
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]  # joints or muscles
 Units = Annotated[int, Meta(ge=1, le=4096)]  # number of units in one layer
+Magnitude = Annotated[float, Meta(ge=0.0, le=LARGEST)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]  # threshold of a detector
 #: copy these entries of the metadata to and from the attributes of `Mae` with the same name
 SHARED = (
@@ -82,8 +88,10 @@ class Metadata(Strict, frozen=True):
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
-    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
+    touch_time: Magnitude | None
     uncertain: bool  # whether the covariance of the estimates is included
+    #: number, mean and standard deviation of the peaks of the evidence for contact
+    touch_peaks: tuple[Magnitude, Magnitude, Magnitude] = NO_PEAKS
     length_spread: bool = False  # whether the possible errors of the learned lengths are included
     drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
@@ -203,6 +211,7 @@ def to_bytes(mae: Mae) -> bytes:
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
         'touch_time': None if touch is None else touch.time,
+        'touch_peaks': NO_PEAKS if touch is None else touch.peaks,
         'drive': touch is not None and touch.drive is not None,
         'uncertain': mae.covariance is not None,
         'length_spread': mae.length_spread is not None,
@@ -393,7 +402,8 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
     if meta.touch_time is not None:
         friction, spread = tensors['touch.friction'], tensors['touch.spread']
         drive = tensors.get('touch.drive'), tensors.get('touch.drive_covariance')
-        touch = TouchStatistics(friction, spread, meta.touch_time, *drive)
+        peaks = Peaks(*meta.touch_peaks)
+        touch = TouchStatistics(friction, spread, meta.touch_time, *drive, peaks)
     elasticity = None
     if meta.elastic:
         elasticity = JointElasticity(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,15 @@ FLOOR = 1e-4
 #: give the residuals of an ignored muscle this standard deviation in scaled units, which is 2000 N
 #: or 1 m, so that they do not matter
 ANYTHING = 10.0
-#: detect contact only after the residual torque was measured during at least this much motion [s]
+#: rely on the residual torque only after it was measured during at least this much motion [s]
 LEAST_MOTION = 60.0
+LEAST_PEAKS = 6  # detect contact only after at least this many peaks (`Peaks`)
+#: The largest evidence in a period follows a Gumbel distribution. In 10 h, which have 3600 periods
+#: of 10 s, its largest value is on average this many standard deviations above the mean.
+RARE = 5.9
+#: with few peaks, take their standard deviation for larger by this share, divided by their number
+FEW = 3.0
+LEAST_SCATTER = 0.15  # assume at least this standard deviation of the peaks, relative to the mean
 
 
 def residuals(
@@ -107,6 +115,30 @@ class AnomalyStatistics:
         return replace(self, mean=mean, covariance=covariance)
 
 
+class Peaks(NamedTuple):
+    """The largest evidence for contact d in each period of 10 s of healthy motion, without contact.
+
+    `estimation/healthy_torque.py` measures them. Rare postures and sudden reversals of friction
+    make single torques much larger than usual, and more so on some arms than on others. Therefore,
+    each arm has a threshold of its own.
+    """
+
+    number: float  # how many peaks have been measured
+    mean: float  # their mean
+    spread: float  # their standard deviation
+
+    @property
+    def threshold(self) -> float:
+        """Value that the evidence of a healthy arm exceeds about once in 10 h of motion."""
+        if self.number < LEAST_PEAKS:
+            return np.inf
+        spread = max(self.spread, LEAST_SCATTER * self.mean)
+        return self.mean + RARE * (1.0 + FEW / self.number) * spread
+
+
+NO_PEAKS = Peaks(0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class TouchStatistics:
     """Tendon friction and residual torque, by which contact is detected."""
@@ -120,8 +152,13 @@ class TouchStatistics:
     drive: Array | None = None
     #: covariances of γ, b and F, (M, 3, 3); None for tension sensors
     drive_covariance: Array | None = None
+    peaks: Peaks = NO_PEAKS  # the largest evidence for contact in healthy motion
 
     @property
     def calibrated(self) -> bool:
-        """Whether the statistics include enough motion to decide on contact."""
+        """Whether the residual torque was measured in enough motion to rely on it."""
         return self.time >= LEAST_MOTION
+
+    def with_measurements_of(self, other: TouchStatistics) -> TouchStatistics:
+        """Return these statistics with what another network knows from healthy motion."""
+        return replace(self, spread=other.spread, time=other.time, peaks=other.peaks)

@@ -8,10 +8,10 @@ import pytest
 from exact_mae import ExactMae
 from readings import reading
 
-from musculoskeletal_ae.estimation.contact import CONTACT, ContactEstimator
+from musculoskeletal_ae.estimation.contact import ContactEstimator
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
-from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
+from musculoskeletal_ae.mae.residuals import LEAST_MOTION, LEAST_PEAKS, Peaks, TouchStatistics
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
@@ -21,11 +21,12 @@ ARM = Robot.load('musashi_left_arm')
 THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])
 DT = 0.01
 SPREAD = np.full(5, 0.2)
+PEAKS = Peaks(60.0, 4.0, 0.8)  # of an arm whose contacts are detected from d = 9 on
 
 
 def observer(spread=SPREAD, time=LEAST_MOTION, robot=ARM):
     mae = ExactMae(robot)
-    mae.touch = TouchStatistics(mae.friction, spread, time)
+    mae.touch = TouchStatistics(mae.friction, spread, time, peaks=PEAKS)
     result = ContactEstimator(robot)
     result.use(mae)
     return result
@@ -136,7 +137,7 @@ def test_a_message_that_is_not_finite_leaves_no_trace():
 
 
 def test_motion_during_a_gap_in_the_messages_is_no_contact(robot, mae):
-    statistics = TouchStatistics(mae.friction, np.full(2, 0.25), LEAST_MOTION)
+    statistics = TouchStatistics(mae.friction, np.full(2, 0.25), LEAST_MOTION, peaks=PEAKS)
     mae = replace(mae, touch=statistics)
     core, middle, time = Estimator(robot), 0.5 * (robot.lower + robot.upper), 0.0
     core.use(mae)
@@ -151,7 +152,7 @@ def test_motion_during_a_gap_in_the_messages_is_no_contact(robot, mae):
         contact = core.take(
             reading(states(tension, mae.lengths(theta, tension))), time, time
         ).contact
-        assert n < 60 or contact.distance < CONTACT
+        assert n < 60 or contact.distance < PEAKS.threshold
 
 
 @pytest.mark.parametrize('dt', [0.0, 0.002, 0.1])
@@ -199,6 +200,34 @@ def swing(core, mae, seconds, true=(0.9, 0.3), push=0.0, is_free=True):
         torque = rng.normal(0.0, 0.1, 2) - (true - used) * velocity + push * np.sign(velocity)
         core.step(torque * is_free, velocity, used, DT)
     return core.put_into(mae)
+
+
+def test_each_arm_has_the_threshold_that_its_healthy_motion_requires(mae):
+    """Two kinds of arms differ in how much their largest external torques exceed the usual ones."""
+    measured = TouchStatistics(np.zeros(10), SPREAD, LEAST_MOTION)
+    known = replace(mae, touch=measured)
+    for tail in (1.0, 3.0):
+        core, rng = HealthyTorque(ARM), np.random.default_rng(0)
+        core.put_into(known)
+
+        def move(seconds, draw, core=core):
+            for _ in range(round(seconds / 0.1)):
+                core.step(SPREAD, np.full(5, 0.3), np.zeros(5), 0.1, draw())
+            return core.put_into(known).touch.peaks.threshold
+
+        def healthy(rng=rng, tail=tail):
+            return 1.5 + rng.exponential(0.3 * tail)
+
+        assert move(9.0 * LEAST_PEAKS, healthy) == np.inf
+        usual = move(600.0, healthy)
+        largest = max(healthy() for _ in range(36_000))  # in an hour
+        assert largest < usual < 2.0 * largest
+        pushed = move(30.0, lambda: 40.0)
+        assert pushed < 1.5 * usual  # contacts hardly count
+        restarted = HealthyTorque(ARM)
+        after = restarted.put_into(core.put_into(known)).touch.peaks
+        assert after.threshold == pushed
+        np.testing.assert_allclose(restarted.peaks, after)
 
 
 def test_damping_is_measured_and_kept_in_the_network(robot, mae):
@@ -283,7 +312,7 @@ def test_a_network_is_used_with_the_residual_torque_measured_so_far(robot, mae):
 
 
 def test_the_estimator_reports_contacts(robot, mae):
-    statistics = TouchStatistics(np.zeros(6), np.full(2, 0.1), LEAST_MOTION)
+    statistics = TouchStatistics(np.zeros(6), np.full(2, 0.1), LEAST_MOTION, peaks=PEAKS)
     core, theta = Estimator(robot), 0.5 * (robot.lower + robot.upper)
     core.use(replace(mae, touch=statistics))
     tension, length = pulling(theta, (10.0, 0.0, 10.0), robot)
