@@ -43,7 +43,7 @@ SLOW = 0.1
 #: average an adopted damping as if it had been measured at about this velocity [rad/s]
 USUAL = 0.3
 PERIOD = 10.0  # find the largest evidence for contact in periods with this much motion [s]
-REMEMBERED = 60  # average over about this many of these peaks (their number as a time constant)
+REMEMBERED = 30  # average over about this many of these peaks (their number as a time constant)
 #: clip a peak to this many standard deviations above the mean of the earlier ones, because a larger
 #: one indicates contact
 PEAK_OUTLIER = 4.0
