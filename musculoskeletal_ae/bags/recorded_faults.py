@@ -20,6 +20,7 @@ from musculoskeletal_ae.signals.wiring import BETTER, Wiring, judge
 #: compare joint angles and lengths only within parts of a recording of this duration [s], because
 #: lengths may drift from one part to the next
 SEGMENT = 30.0
+UNUSED = 0.3  # leave out muscles that do not count in this share of the rows
 PROBLEMS = read_problems(__file__, 'joint_sensor_problems.yaml')
 
 
@@ -35,8 +36,8 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
 
     Columns of muscles can be exchanged, and lengths can have the wrong sign. Joint sensors can have
     the wrong sign or the wrong unit, be swapped with each other, or repeat one reading while the
-    arm moves. Muscles that are isolated at any time during the recording are left out of the
-    comparison.
+    arm moves. Muscles that are isolated or suspected of a fault for a large part of the recording
+    (UNUSED) are left out of the comparison, and so is the time in which others are.
 
     On a symmetric arm, angles with the wrong sign look like exchanged muscles. Joint sensors are
     reported if correcting them explains all lengths, and not clearly worse (`wiring.BETTER`) than
@@ -49,10 +50,11 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
             be stuck from one to the next.
     """
     straight = Wiring.straight(robot.muscle_count)
-    if np.count_nonzero(np.isfinite(recording.theta).all(axis=1)) < 2:
+    is_unreliable = recording.isolated == 1
+    used = is_unreliable.sum(axis=0) < UNUSED * len(recording.time)
+    time, theta, length, tension, _ = recording.at(~is_unreliable[:, used].any(axis=1))
+    if np.count_nonzero(np.isfinite(theta).all(axis=1)) < 2:
         return RecordedFaults(straight, [])
-    time, theta, length, tension, isolated = recording
-    used = ~(isolated == 1).any(axis=0)
     segments = ((time - time[0]) // SEGMENT).astype(int) * (not at_rest)
 
     inside = theta.clip(robot.lower, robot.upper)

@@ -30,6 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import rare_peak
 from musculoskeletal_ae.robot.robot import Robot
 
 #: filter joint angles and torques with this bandwidth ω [1/s] and a damping ratio of 0.5; critical
@@ -111,8 +112,10 @@ class ContactEstimator:
     Attributes:
         velocity: Filtered joint velocities θ̇ [rad/s], (D,).
         damping: Damping of the joints in the network [N·m·s/rad], (D,).
-        threshold: Report contact if the evidence d exceeds this (d_max); ∞ until the arm has moved
-            enough without contact.
+        is_calibrated: Whether the network contains the residual torque σ, without which there is no
+            evidence for contact.
+        threshold: Report contact if the evidence d exceeds this (d_max). It is ∞ until the arm has
+            moved enough. Owners that measure the healthy torque themselves update it.
         count: Number of contacts detected so far.
     """
 
@@ -122,7 +125,7 @@ class ContactEstimator:
         self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP
         self._filter = LowPass(BANDWIDTH)
         self.threshold = math.inf
-        self._is_calibrated = False
+        self.is_calibrated = False
         self.count = 0
         self.reset()
 
@@ -138,10 +141,10 @@ class ContactEstimator:
         self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated last
         self._weight = np.ones(joint_count)  # 1/σ², (D,); 1 without a calibrated σ
         self.threshold = math.inf
-        self._is_calibrated = healthy is not None and healthy.calibrated
-        if healthy is not None and self._is_calibrated:
+        self.is_calibrated = healthy is not None and healthy.calibrated
+        if healthy is not None and self.is_calibrated:
             self._weight = 1.0 / healthy.spread**2
-            self.threshold = healthy.peaks.threshold
+            self.threshold = rare_peak(healthy.peaks)
 
     def reset(self) -> None:
         """Reset the filter, for example after a jump of the clock."""
@@ -173,7 +176,7 @@ class ContactEstimator:
             self.reset()
             return Contact(np.zeros(joint_count), lambda: np.zeros(3), math.nan, False)
         distance = math.nan
-        if self._is_calibrated:
+        if self.is_calibrated:
             distance = math.sqrt(self._weight @ (torque * torque))
         self._beyond = self._beyond + 1 if distance > self.threshold else 0
         self.count += self._beyond == IN_A_ROW

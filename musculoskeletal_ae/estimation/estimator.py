@@ -559,6 +559,8 @@ class Estimator:
                 self.healthy_torque.step(
                     load.torque, contact.velocity, contact.damping, sent_apart, load.distance
                 )
+                if contact.is_calibrated:
+                    contact.threshold = self.healthy_torque.threshold
         if known and self.suspects.finding is None:
             self.health.step_healthy(observation, self.load)
             self._follow_joint_trust()

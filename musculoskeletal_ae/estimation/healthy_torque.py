@@ -12,21 +12,22 @@ velocity. The means E are formed like σ_j². t_j is the time of motion in which
 most MEMORY.
 
 `estimation/contact.py` divides the external torque by σ, which gives the evidence for contact d.
-The largest d of each period of PERIOD is a peak. Mean and standard deviation of the peaks determine
-how large d has to be to indicate contact (`mae/residuals.py`).
+The largest d of each period of PERIOD is a peak. The last peaks determine how large d has to be to
+indicate contact (`rare_peak`).
 
 The damping becomes part of the network's `elasticity`, so that contact detection and motion plans
 consider it.
 """
 
 import math
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import LEAST_MOTION, LEAST_PEAKS, Peaks
+from musculoskeletal_ae.mae.residuals import LEAST_MOTION, rare_peak
 from musculoskeletal_ae.robot.robot import Robot
 
 MEMORY = 180.0  # average the squared torque over this much time in motion (time constant) [s]
@@ -43,10 +44,7 @@ SLOW = 0.1
 #: average an adopted damping as if it had been measured at about this velocity [rad/s]
 USUAL = 0.3
 PERIOD = 10.0  # find the largest evidence for contact in periods with this much motion [s]
-REMEMBERED = 30  # average over about this many of these peaks (their number as a time constant)
-#: clip a peak to this many standard deviations above the mean of the earlier ones, because a larger
-#: one indicates contact
-PEAK_OUTLIER = 4.0
+REMEMBERED = 30  # keep this many of these peaks
 LEAST_SPREAD = 1e-3  # store at least this σ in the network [N·m], because torques are divided by it
 
 
@@ -55,6 +53,10 @@ class HealthyTorque:
 
     The averages cover the last minutes of motion, even if the network changed meanwhile. Nothing is
     measured until a network knows the friction of the tendons, which would count as damping.
+
+    Attributes:
+        threshold: Evidence for contact d above which there is contact; ∞ until the arm has moved
+            enough with a network that contains its residual torque σ.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -62,8 +64,8 @@ class HealthyTorque:
         self._means = np.zeros((3, robot.joint_count))  # means of τ², θ̇⁴ and θ̇³ τ'
         self._time = np.zeros(robot.joint_count)  # t_j [s]
         self._is_measuring = False
-        #: number of peaks, their mean and the mean of their squares
-        self._number, self._peak, self._peak_square = 0.0, 0.0, 0.0
+        self._peaks = deque[float](maxlen=REMEMBERED)
+        self.threshold = math.inf
         self._period, self._largest = 0.0, 0.0  # time in this period [s], largest d in it
 
     def put_into(self, mae: Mae) -> Mae:
@@ -71,7 +73,7 @@ class HealthyTorque:
 
         A network that contains no σ is returned unchanged. Before the first measurement, the values
         of the network are adopted instead, and later measurements are averaged with them. Damping
-        needs as much motion as the detection of contact (`TouchStatistics.calibrated`). Until a
+        needs as much motion as σ (`TouchStatistics.calibrated`). Until a
         joint has moved so much away from its stops, it keeps its damping, and its σ is at least
         those of the other joints.
         """
@@ -87,11 +89,13 @@ class HealthyTorque:
             product = (fourth + SLOW**4) * (self._stated.damping - springs.damping)
             self._means = np.array([known.spread**2, fourth, product])
             self._time = np.full_like(known.spread, known.time)
-            self._number, self._peak, spread = known.peaks
-            self._peak_square = self._peak**2 + spread**2
+            self._peaks.extend(known.peaks)
+            self.threshold = rare_peak(known.peaks)
             return mae
         spread = np.maximum(np.sqrt(self._means[0]), LEAST_SPREAD)
-        touch = replace(known, spread=spread, time=float(self._time.max()), peaks=self.peaks)
+        touch = replace(
+            known, spread=spread, time=float(self._time.max()), peaks=np.array(self._peaks)
+        )
         if not touch.calibrated:
             return replace(mae, touch=touch)
         enough = self._time >= LEAST_MOTION
@@ -104,12 +108,6 @@ class HealthyTorque:
             touch=replace(touch, spread=spread),
             elasticity=replace(springs, damping=damping),
         )
-
-    @property
-    def peaks(self) -> Peaks:
-        """The peaks of the evidence for contact so far."""
-        variance = max(self._peak_square - self._peak**2, 0.0)
-        return Peaks(self._number, self._peak, math.sqrt(variance))
 
     def step(
         self,
@@ -149,17 +147,11 @@ class HealthyTorque:
         self._means = self._means + np.array([share, of_damping, of_damping]) * change
 
     def _step_peak(self, evidence: float, dt: float) -> None:
-        """Update the largest evidence of the present period; average it when the period ends."""
+        """Update the largest evidence of the present period; at its end, update the threshold."""
         if math.isnan(evidence):
             return
         self._period, self._largest = self._period + dt, max(self._largest, evidence)
-        if self._period < PERIOD:
-            return
-        _, mean, spread = self.peaks
-        peak = self._largest
-        if self._number >= LEAST_PEAKS:
-            peak = min(peak, mean + PEAK_OUTLIER * spread)
-        self._number = min(self._number + 1.0, float(REMEMBERED))
-        self._peak += (peak - self._peak) / self._number
-        self._peak_square += (peak**2 - self._peak_square) / self._number
-        self._period = self._largest = 0.0
+        if self._period >= PERIOD:
+            self._peaks.append(self._largest)
+            self.threshold = rare_peak(np.array(self._peaks))
+            self._period = self._largest = 0.0

@@ -22,12 +22,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
-from musculoskeletal_ae.mae.residuals import (
-    NO_PEAKS,
-    AnomalyStatistics,
-    Peaks,
-    TouchStatistics,
-)
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
 from musculoskeletal_ae.presets.preset import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
@@ -90,8 +85,7 @@ class Metadata(Strict, frozen=True):
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
     touch_time: Magnitude | None
     uncertain: bool  # whether the covariance of the estimates is included
-    #: number, mean and standard deviation of the peaks of the evidence for contact
-    touch_peaks: tuple[Magnitude, Magnitude, Magnitude] = NO_PEAKS
+    touch_peaks: Annotated[int, Meta(ge=0, le=1000)] = 0  # number of peaks in the touch statistics
     length_spread: bool = False  # whether the possible errors of the learned lengths are included
     drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
@@ -162,6 +156,8 @@ class Metadata(Strict, frozen=True):
             shapes['anomaly.postures'] = self.anomaly_postures, len(self.joints)
         if self.touch_time is not None:
             shapes |= {'touch.friction': (len(self.muscles),), 'touch.spread': (len(self.joints),)}
+        if self.touch_time is not None and self.touch_peaks:
+            shapes['touch.peaks'] = (self.touch_peaks,)
         if self.touch_time is not None and self.drive:
             shapes['touch.drive'] = 3, len(self.muscles)
             shapes['touch.drive_covariance'] = len(self.muscles), 3, 3
@@ -190,6 +186,8 @@ def to_bytes(mae: Mae) -> bytes:
     touch = mae.touch
     if touch is not None:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
+        if len(touch.peaks):
+            tensors['touch.peaks'] = touch.peaks
         if touch.drive is not None:
             certain = np.zeros((len(mae.muscles), 3, 3))
             known = touch.drive_covariance
@@ -211,7 +209,7 @@ def to_bytes(mae: Mae) -> bytes:
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
         'touch_time': None if touch is None else touch.time,
-        'touch_peaks': NO_PEAKS if touch is None else touch.peaks,
+        'touch_peaks': 0 if touch is None else len(touch.peaks),
         'drive': touch is not None and touch.drive is not None,
         'uncertain': mae.covariance is not None,
         'length_spread': mae.length_spread is not None,
@@ -338,8 +336,9 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
         value_text, limit = distinct(most, LARGEST_GAIN)
         problem = f'tensor touch.drive has a gain of ±{value_text}; legal: -{limit} to {limit}'
         raise CheckpointError(problem)
-    if (least := tensors.get('length_spread', np.zeros(1)).min()) < 0.0:
-        raise CheckpointError(f'tensor length_spread has the value {least:g}; legal: 0 or more')
+    for name in ('length_spread', 'touch.peaks'):
+        if (least := tensors.get(name, np.zeros(1)).min()) < 0.0:
+            raise CheckpointError(f'tensor {name} has the value {least:g}; legal: 0 or more')
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
             _check_covariance(name, tensors[name])
@@ -402,7 +401,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
     if meta.touch_time is not None:
         friction, spread = tensors['touch.friction'], tensors['touch.spread']
         drive = tensors.get('touch.drive'), tensors.get('touch.drive_covariance')
-        peaks = Peaks(*meta.touch_peaks)
+        peaks = tensors.get('touch.peaks', np.empty(0))
         touch = TouchStatistics(friction, spread, meta.touch_time, *drive, peaks)
     elasticity = None
     if meta.elastic:

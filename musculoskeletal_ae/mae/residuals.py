@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,13 +29,18 @@ FLOOR = 1e-4
 ANYTHING = 10.0
 #: rely on the residual torque only after it was measured during at least this much motion [s]
 LEAST_MOTION = 60.0
-LEAST_PEAKS = 6  # detect contact only after at least this many peaks (`Peaks`)
-#: The largest evidence in a period follows a Gumbel distribution. In 10 h, which have 3600 periods
-#: of 10 s, its largest value is on average this many standard deviations above the mean.
+LEAST_PEAKS = 6  # detect contact only after at least this many peaks (`rare_peak`)
+#: Largest values of long periods follow a Gumbel distribution, of which a value this many standard
+#: deviations above the mean is exceeded once in 3600 periods, that is, in 10 h.
 RARE = 5.9
 #: with few peaks, take their standard deviation for larger by this share, divided by their number
 FEW = 3.0
-LEAST_SCATTER = 0.15  # assume at least this standard deviation of the peaks, relative to the mean
+LEAST_SCATTER = 0.15  # assume at least this standard deviation of the peaks, relative to the median
+#: standard deviation of a Gumbel distribution, relative to its median absolute deviation
+GUMBEL = 1.67
+#: clip peaks to the median plus this many standard deviations (by the median absolute deviation):
+#: larger ones are contacts, or rare postures in which an arm has large external torques
+OUTLYING = 6.0
 
 
 def residuals(
@@ -115,28 +119,26 @@ class AnomalyStatistics:
         return replace(self, mean=mean, covariance=covariance)
 
 
-class Peaks(NamedTuple):
-    """The largest evidence for contact d in each period of 10 s of healthy motion, without contact.
+def rare_peak(peaks: Array) -> float:
+    """Return the evidence for contact d that a healthy arm exceeds about once in 10 h of motion.
 
-    `estimation/healthy_torque.py` measures them. Rare postures and sudden reversals of friction
-    make single torques much larger than usual, and more so on some arms than on others. Therefore,
-    each arm has a threshold of its own.
+    The result is ∞ if there are too few peaks.
+
+    Rare postures and sudden reversals of friction make single torques much larger than usual, and
+    more so on some arms than on others. Therefore, each arm has a threshold of its own.
+
+    Args:
+        peaks: The largest d in each period of 10 s of motion, (N,). A minority of the periods may
+            contain contacts.
     """
-
-    number: float  # how many peaks have been measured
-    mean: float  # their mean
-    spread: float  # their standard deviation
-
-    @property
-    def threshold(self) -> float:
-        """Value that the evidence of a healthy arm exceeds about once in 10 h of motion."""
-        if self.number < LEAST_PEAKS:
-            return np.inf
-        spread = max(self.spread, LEAST_SCATTER * self.mean)
-        return self.mean + RARE * (1.0 + FEW / self.number) * spread
-
-
-NO_PEAKS = Peaks(0.0, 0.0, 0.0)
+    if len(peaks) < LEAST_PEAKS:
+        return np.inf
+    middle = np.median(peaks)
+    least = LEAST_SCATTER * middle
+    usual = max(GUMBEL * np.median(np.abs(peaks - middle)), least)
+    bounded = np.minimum(peaks, middle + OUTLYING * usual)
+    spread = max(bounded.std(ddof=1), least)
+    return float(bounded.mean() + RARE * (1.0 + FEW / len(peaks)) * spread)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,8 @@ class TouchStatistics:
     drive: Array | None = None
     #: covariances of γ, b and F, (M, 3, 3); None for tension sensors
     drive_covariance: Array | None = None
-    peaks: Peaks = NO_PEAKS  # the largest evidence for contact in healthy motion
+    #: the largest evidence for contact in the last periods of healthy motion, (N,), N ≥ 0
+    peaks: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def calibrated(self) -> bool:
