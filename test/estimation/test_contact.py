@@ -227,7 +227,7 @@ def test_each_arm_has_the_threshold_that_its_healthy_motion_requires(mae):
         assert restarted.threshold == core.threshold == usual
 
 
-def test_pushes_raise_the_threshold_only_a_little_and_not_for_long(mae):
+def test_pushes_raise_the_threshold_by_a_bounded_factor_and_not_for_long(mae):
     known = replace(mae, touch=TouchStatistics(np.zeros(10), SPREAD, LEAST_MOTION))
     core, rng = HealthyTorque(ARM), np.random.default_rng(0)
     core.put_into(known)
@@ -242,7 +242,7 @@ def test_pushes_raise_the_threshold_only_a_little_and_not_for_long(mae):
     early = move(10.0, push=40.0)
     usual = move(600.0)
     assert early < 5.0 * usual
-    assert move(120.0, push=40.0) < 3.0 * usual
+    assert move(120.0, push=40.0) < 6.0 * usual
     assert move(310.0) < 1.3 * usual
 
 
