@@ -42,6 +42,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.contact import APART, CONTACT_STREAM, MOVED, SOON, ContactLoop
 from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import rare_peak
 from musculoskeletal_ae.options import Parser, number, positive, whole
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -164,7 +165,7 @@ def push(lab: BusyLoop, seed: int, count: int) -> Pushes:
         MusculoskeletalError: If the arm has not moved long enough to calibrate contact detection.
     """
     arm, mae, rng = lab.arm, lab.estimator.mae, np.random.default_rng([seed, CONTACT_STREAM])
-    if mae is None or mae.touch is None or not mae.touch.calibrated:
+    if mae is None or mae.touch is None or np.isinf(rare_peak(mae.touch.peaks)):
         raise MusculoskeletalError(
             f'contact detection is not calibrated after {lab.now:.0f} s; choose more --hours'
         )

@@ -86,17 +86,23 @@ def measure(study: Study, seed: int) -> Measured:
     robot, rng = study.robot, np.random.default_rng([seed, CONTACT_STREAM])
     settings = Settings(first_duration=2.0)
     loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed)
-    pushes = []
+    tried = []
     for _ in range(study.number(POSTURES)):
         loop.rest(_holdable(robot, rng))
-        pushes += [_push_at_rest(loop, _force(robot, rng, LEAST, MOST)) for _ in range(2)]
+        tried += [_push_at_rest(loop, _force(robot, rng, LEAST, MOST)) for _ in range(2)]
+    pushes = [push for push in tried if push is not None]
+    if not pushes:
+        raise MusculoskeletalError(
+            f'each of {len(tried)} pushes of {LEAST:g} to {MOST:g} N on the hand of individual '
+            f'{seed} led to a finding, after which no external force is estimated'
+        )
     forces, delays = _collisions(loop, rng, study.number(COLLISIONS))
     soon = delays <= SOON + 1e-9
     loop.arm.reset()
     # To the estimator of the other loop, the reset would be a jump of all lengths.
     loop = ContactLoop(loop.arm, study.network(seed), settings, CONTACT_STREAM + seed)
     seconds = study.seconds(HEALTHY / len(study.seeds))
-    contacts = _healthy(loop, seconds, study.seconds(WARM_UP))
+    contacts, seconds = _healthy(loop, seconds, study.seconds(WARM_UP))
     drift, moved = zip(*(_guide_by_hand(study, seed, rng) for _ in range(study.number(FLOATS))))
     true, estimated, free = columns(pushes)
     size, angle = _errors(true, estimated)
@@ -104,6 +110,7 @@ def measure(study: Study, seed: int) -> Measured:
         'wrench_error': float(size.mean()),
         'wrench_error_deg': float(angle.mean()),
         'pushes_free_share': float(free.mean()),
+        'pushes_left_out': len(tried) - len(pushes),
         'false_contacts': contacts,
         'healthy_touch_s': seconds,
         'float_drift_rad': float(np.max(drift)),
@@ -151,21 +158,27 @@ def _holdable(robot: Robot, rng: np.random.Generator) -> Array:
     return theta
 
 
-def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
+def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool] | None:
     """Push the hand of the resting arm.
 
     Returns:
         The force [N] (3,), its estimate [N] (3,) averaged over the last EVALUATED [s] of the push,
-        and whether all joints stayed within their limits.
+        and whether all joints stayed within their limits. None if the push led to a finding, after
+        which no force is estimated.
     """
     robot, estimates, free = loop.arm.robot, list[Array](), True
     loop.push(force)
+    is_estimated = True
     for _ in range(round(PUSH / SAMPLE_TIME)):
-        estimates.append(loop.contact().force())
+        contact = loop.contact()
+        is_estimated &= contact is not NOTHING
+        estimates.append(contact.force())
         theta = loop.arm.theta
         free &= bool(((theta > robot.lower) & (theta < robot.upper)).all())
     loop.push(np.zeros(3))
     loop.contacts_during(MOVED)
+    if not is_estimated:
+        return None
     evaluated = estimates[-round(EVALUATED / SAMPLE_TIME) :]
     return force, np.mean(evaluated, axis=0), free
 
@@ -194,16 +207,18 @@ def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Arra
     return np.array(collisions).reshape(-1, 2).T
 
 
-def _healthy(loop: ContactLoop, seconds: float, warm_up: float) -> int:
-    """Return how many contacts are wrongly detected while an arm explores without any contact.
+def _healthy(loop: ContactLoop, seconds: float, warm_up: float) -> tuple[int, float]:
+    """Let an arm explore without any contact; return the number of false contacts, and the time.
 
     The arm explores for `warm_up` [s] first. Contacts are counted in the following `seconds` [s].
     """
-    contacts, before = 0, False
+    contacts, before, counted = 0, False, 0
     for n in range(round((seconds + warm_up) / SAMPLE_TIME)):
-        now = loop.contact(exploring=True).is_contact and n * SAMPLE_TIME > warm_up
-        contacts, before = contacts + (now and not before), now
-    return contacts
+        contact = loop.contact(exploring=True)
+        is_counted = contact is not NOTHING and n * SAMPLE_TIME >= warm_up
+        now = contact.is_contact and is_counted
+        contacts, before, counted = contacts + (now and not before), now, counted + is_counted
+    return contacts, counted * SAMPLE_TIME
 
 
 def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, float]:
