@@ -12,8 +12,8 @@ velocity. The means E are formed like σ_j². t_j is the time of motion in which
 most MEMORY.
 
 `estimation/contact.py` divides the external torque by σ, which gives the evidence for contact d.
-The largest d of each period of PERIOD is a peak. The last peaks determine how large d has to be to
-indicate contact (`rare_peak`).
+The largest d of each period of PERIOD without contact is a peak. The last peaks determine how large
+d has to be to indicate contact (`rare_peak`).
 
 The damping becomes part of the network's `elasticity`, so that contact detection and motion plans
 consider it.
@@ -45,6 +45,9 @@ SLOW = 0.1
 USUAL = 0.3
 PERIOD = 10.0  # find the largest evidence for contact in periods with this much motion [s]
 REMEMBERED = 30  # keep this many of these peaks
+#: once so many consecutive periods had contacts, which would otherwise not count, take the contacts
+#: for false ones, and the largest d of these periods for peaks
+FALSE = 30
 LEAST_SPREAD = 1e-3  # store at least this σ in the network [N·m], because torques are divided by it
 
 
@@ -67,6 +70,7 @@ class HealthyTorque:
         self._peaks = deque[float](maxlen=REMEMBERED)
         self.threshold = math.inf
         self._period, self._largest = 0.0, 0.0  # time in this period [s], largest d in it
+        self._left_out = deque[float](maxlen=FALSE)  # peaks of the last periods, all with contacts
 
     def put_into(self, mae: Mae) -> Mae:
         """Put the measured damping and residual torque σ into a copy of a network; return the copy.
@@ -151,7 +155,12 @@ class HealthyTorque:
         if math.isnan(evidence):
             return
         self._period, self._largest = self._period + dt, max(self._largest, evidence)
-        if self._period >= PERIOD:
-            self._peaks.append(self._largest)
+        if self._period < PERIOD:
+            return
+        peak, self._period, self._largest = self._largest, 0.0, 0.0
+        self._left_out.append(peak)
+        if peak <= self.threshold or len(self._left_out) == FALSE:
+            new = [peak] if peak <= self.threshold else self._left_out
+            self._peaks.extend(new)
+            self._left_out.clear()
             self.threshold = rare_peak(np.array(self._peaks))
-            self._period = self._largest = 0.0
