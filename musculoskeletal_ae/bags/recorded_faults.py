@@ -20,7 +20,8 @@ from musculoskeletal_ae.signals.wiring import BETTER, Wiring, judge
 #: compare joint angles and lengths only within parts of a recording of this duration [s], because
 #: lengths may drift from one part to the next
 SEGMENT = 30.0
-UNUSED = 0.3  # leave out muscles that do not count in this share of the rows
+#: leave out muscles that are isolated or suspected of a fault in at least this share of the rows
+UNUSED = 0.3
 PROBLEMS = read_problems(__file__, 'joint_sensor_problems.yaml')
 
 
@@ -37,7 +38,7 @@ def find_faults(robot: Robot, recording: Pairs, at_rest: bool = False) -> Record
     Columns of muscles can be exchanged, and lengths can have the wrong sign. Joint sensors can have
     the wrong sign or the wrong unit, be swapped with each other, or repeat one reading while the
     arm moves. Muscles that are isolated or suspected of a fault for a large part of the recording
-    (UNUSED) are left out of the comparison, and so is the time in which others are.
+    (UNUSED) are not compared. Rows in which another muscle is so are left out for all muscles.
 
     On a symmetric arm, angles with the wrong sign look like exchanged muscles. Joint sensors are
     reported if correcting them explains all lengths, and not clearly worse (`wiring.BETTER`) than

@@ -203,9 +203,9 @@ class _ArmStreams:
         return body.rows
 
     def isolated(self) -> Series:
-        """Return, for each body state, 1 for muscles that cannot be relied on, and 0 for others.
+        """Return which muscles are isolated or suspected of a fault, as 1, others as 0.
 
-        These are the isolated muscles, and the suspect while its anomaly is present.
+        The series has one row for each recorded body state.
         """
         unreliable = [~body.used | body.suspected for body in self._bodies]
         shape = -1, self._robot.muscle_count

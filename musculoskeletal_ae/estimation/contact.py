@@ -3,15 +3,16 @@
 
     τ_ext = M(θ) θ̈ + h(θ, θ̇) + Gᵀ T_end,   T_end = T e^{−μ s}
     F     = argmin Σ_j ((JᵀF − τ_ext)_j / σ_j)² + ‖F‖²/F₀²,   without a moment at the hand
-    d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > d_max in IN_A_ROW consecutive messages
+    d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > d_max in two consecutive messages
 
 τ_ext is the external torque at the joints, F the force at the hand, and d the evidence for contact.
 M is the inertia matrix, G the muscle Jacobian ∂l/∂θ, and J the Jacobian of the hand. h contains the
 torques due to velocity and weight, and those of the joints' springs and dampers. The bone-side
 tension T_end follows from the measured tension T, tendon friction μ, and the direction s in which a
 tendon slid last (`signals/friction.py`). σ is the residual torque of the healthy moving arm, and
-d_max is what its d exceeds about once in 10 h (`estimation/healthy_torque.py`). The term with F₀
-limits components of F that produce no joint torque, such as the component along a stretched arm.
+d_max is the threshold that d exceeds without contact about once in 10 h; both are measured
+(`estimation/healthy_torque.py`). The term with F₀ limits components of F that produce no joint
+torque, such as the component along a stretched arm.
 
 θ and Gᵀ T_end pass through the same second-order low-pass filter, which also yields θ̇ and θ̈. The
 result is the residual of the momentum observer (De Luca 2005), without numerical differentiation
@@ -46,7 +47,7 @@ AT_STOP = 0.06
 #: evaluate the muscle Jacobian G again once a joint has moved by this much [rad], not at every
 #: message, because G changes slowly
 TURNED = 0.02
-IN_A_ROW = 2  # report contact once d exceeds d_max in this many consecutive messages
+IN_A_ROW = 2  # report contact once d exceeds its threshold in this many consecutive messages
 
 
 class Contact(NamedTuple):
@@ -150,7 +151,7 @@ class ContactEstimator:
         """Reset the filter, for example after a jump of the clock."""
         self._filter.reset()
         self.velocity: Array = np.zeros(self._robot.joint_count)
-        self._beyond = 0  # consecutive messages with d > d_max
+        self._beyond = 0  # how many consecutive messages had d above its threshold
 
     def step(self, theta: Array, end_tension: Array, dt: float) -> Contact:
         """Step the filter by one message, and return the external load.

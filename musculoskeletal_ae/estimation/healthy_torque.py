@@ -12,11 +12,11 @@ velocity. The means E are formed like σ_j². t_j is the time of motion in which
 most MEMORY.
 
 `estimation/contact.py` divides the external torque by σ, which gives the evidence for contact d.
-The largest d of each period of PERIOD without contact is a peak. The last peaks determine how large
-d has to be to indicate contact (`rare_peak`).
+The largest d of each PERIOD is a peak of this period. The peaks of the last periods without contact
+determine how large d has to be to indicate contact (`rare_peak`).
 
-The damping becomes part of the network's `elasticity`, so that contact detection and motion plans
-consider it.
+The estimator writes the measured damping into the network (`Mae.elasticity`), from which contact
+detection and motion plans take it.
 """
 
 import math
@@ -44,10 +44,10 @@ SLOW = 0.1
 #: average an adopted damping as if it had been measured at about this velocity [rad/s]
 USUAL = 0.3
 PERIOD = 10.0  # find the largest evidence for contact in periods with this much motion [s]
-REMEMBERED = 30  # keep this many of these peaks
-#: once so many consecutive periods had contacts, which would otherwise not count, take the contacts
-#: for false ones, and the largest d of these periods for peaks
-FALSE = 30
+REMEMBERED = 30  # determine the threshold from the peaks of this many periods
+#: Periods with contact are left out. If this many in a row had contact, the arm has changed, and
+#: the threshold is too low: use their peaks.
+MOST_LEFT_OUT = 30
 LEAST_SPREAD = 1e-3  # store at least this σ in the network [N·m], because torques are divided by it
 
 
@@ -68,9 +68,11 @@ class HealthyTorque:
         self._time = np.zeros(robot.joint_count)  # t_j [s]
         self._is_measuring = False
         self._peaks = deque[float](maxlen=REMEMBERED)
+        self._left_out = list[
+            float
+        ]()  # peaks of the periods with contact since the last one without
         self.threshold = math.inf
-        self._period, self._largest = 0.0, 0.0  # time in this period [s], largest d in it
-        self._left_out = deque[float](maxlen=FALSE)  # peaks of the last periods, all with contacts
+        self._moved, self._largest = 0.0, 0.0  # of this period: time in motion [s], and largest d
 
     def put_into(self, mae: Mae) -> Mae:
         """Put the measured damping and residual torque σ into a copy of a network; return the copy.
@@ -151,16 +153,19 @@ class HealthyTorque:
         self._means = self._means + np.array([share, of_damping, of_damping]) * change
 
     def _step_peak(self, evidence: float, dt: float) -> None:
-        """Update the largest evidence of the present period; at its end, update the threshold."""
+        """Update the largest evidence of this period; at its end, update the threshold."""
         if math.isnan(evidence):
             return
-        self._period, self._largest = self._period + dt, max(self._largest, evidence)
-        if self._period < PERIOD:
+        self._moved, self._largest = self._moved + dt, max(self._largest, evidence)
+        if self._moved < PERIOD:
             return
-        peak, self._period, self._largest = self._largest, 0.0, 0.0
-        self._left_out.append(peak)
-        if peak <= self.threshold or len(self._left_out) == FALSE:
-            new = [peak] if peak <= self.threshold else self._left_out
-            self._peaks.extend(new)
-            self._left_out.clear()
-            self.threshold = rare_peak(np.array(self._peaks))
+        peak, self._moved, self._largest = self._largest, 0.0, 0.0
+        if peak > self.threshold:
+            self._left_out.append(peak)
+            if len(self._left_out) < MOST_LEFT_OUT:
+                return
+            self._peaks.extend(self._left_out)
+        else:
+            self._peaks.append(peak)
+        self._left_out.clear()
+        self.threshold = rare_peak(np.array(self._peaks))

@@ -2,7 +2,6 @@
 """Measure contact estimation and hand guiding, as a part of the experiment `motion`."""
 
 import math
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -41,7 +40,7 @@ SOON = 0.1  # report the share of collisions that are detected within this time 
 INSIDE = 0.1  # keep random postures away from the joint limits by this fraction of the joint ranges
 
 
-#: what is estimated while lengths are unknown
+#: stands for the estimate that is missing while length offsets are unknown
 NOTHING = Contact(np.zeros(0), lambda: np.zeros(3), math.nan, False)
 
 
@@ -66,9 +65,7 @@ class ContactLoop(ClosedLoop):
     def rest(self, theta: Array) -> None:
         """End the push, end a stop that it may have caused, and move to θ [rad] (D,)."""
         self.push(np.zeros(3))
-        if self.estimator.body.has_anomaly:
-            with suppress(MusculoskeletalError):
-                self.estimator.reset()
+        self.end_finding()
         self.core.reset(self.time)
         self.target(theta)
         self.contacts_during(MOVE)
@@ -208,7 +205,7 @@ def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Arra
 
 
 def _healthy(loop: ContactLoop, seconds: float, warm_up: float) -> tuple[int, float]:
-    """Let an arm explore without any contact; return the number of false contacts, and the time.
+    """Let an arm explore without contact; return the number of false contacts, and the time [s].
 
     The arm explores for `warm_up` [s] first. Contacts are counted in the following `seconds` [s].
     """

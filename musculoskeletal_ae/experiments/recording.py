@@ -131,16 +131,20 @@ class ClosedLoop:
         If the arm has stopped, estimator and controller are reset first, which succeeds as soon as
         the cause of the stop has cleared. A verification is not interrupted.
         """
-        core, estimator = self.core, self.estimator
+        core = self.core
         supervisor = core.supervisor
-        if estimator.body.anomaly is Anomaly.FOUND:
-            with suppress(MusculoskeletalError):  # refused while the suspect is implausible
-                estimator.reset()
+        self.end_finding()
         if not supervisor.is_running and core.reset(self.time) is None:
             self.stops += 1
         if supervisor.is_running and not supervisor.explores:
             core.explore(True)
         return self.step()
+
+    def end_finding(self) -> None:
+        """Reset the estimator if it has found a fault. A verification is not interrupted."""
+        if self.estimator.body.anomaly is Anomaly.FOUND:
+            with suppress(MusculoskeletalError):  # refused while the suspect is implausible
+                self.estimator.reset()
 
     def go(self, theta: Array, duration: float) -> None:
         """Move towards θ [rad] (D,) for `duration` [s].

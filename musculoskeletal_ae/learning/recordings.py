@@ -304,8 +304,9 @@ def mean_error(off: Array) -> float:
 
 
 def isolated_in(row: Ints, default: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the indices of the isolated muscles; `default` if they were not recorded.
+    """Return the indices of the muscles to isolate; `default` if they were not recorded.
 
-    `row` is a row of `Pairs.isolated`: 1 for an isolated muscle, 0 for others, negative if unknown.
+    `row` is a row of `Pairs.isolated`: 1 for a muscle that was isolated or suspected of a fault, 0
+    for others, negative if unknown.
     """
     return default if (row < 0).any() else tuple(map(int, np.flatnonzero(row)))

@@ -55,7 +55,6 @@ LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
 Count = Annotated[int, Meta(ge=0, le=2**53)]  # a whole number that JSON represents exactly
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]  # joints or muscles
 Units = Annotated[int, Meta(ge=1, le=4096)]  # number of units in one layer
-Magnitude = Annotated[float, Meta(ge=0.0, le=LARGEST)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]  # threshold of a detector
 #: copy these entries of the metadata to and from the attributes of `Mae` with the same name
 SHARED = (
@@ -83,7 +82,7 @@ class Metadata(Strict, frozen=True):
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
-    touch_time: Magnitude | None
+    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
     uncertain: bool  # whether the covariance of the estimates is included
     touch_peaks: Annotated[int, Meta(ge=0, le=1000)] = 0  # number of peaks in the touch statistics
     length_spread: bool = False  # whether the possible errors of the learned lengths are included

@@ -29,17 +29,17 @@ FLOOR = 1e-4
 ANYTHING = 10.0
 #: rely on the residual torque only after it was measured during at least this much motion [s]
 LEAST_MOTION = 60.0
-LEAST_PEAKS = 6  # detect contact only after at least this many peaks (`rare_peak`)
-#: Largest values of long periods follow a Gumbel distribution, of which a value this many standard
-#: deviations above the mean is exceeded once in 3600 periods, that is, in 10 h.
+LEAST_PEAKS = 6  # detect contact only once this many peaks are known (`rare_peak`)
+#: Peaks are assumed to follow a Gumbel distribution. One peak in 3600, which is one in 10 h, is at
+#: least this many standard deviations above their mean.
 RARE = 5.9
-#: with few peaks, take their standard deviation for larger by this share, divided by their number
+#: N peaks determine their standard deviation badly if N is small: multiply it by 1 + FEW / N
 FEW = 3.0
 LEAST_SCATTER = 0.15  # assume at least this standard deviation of the peaks, relative to the median
 #: standard deviation of a Gumbel distribution, relative to its median absolute deviation
 GUMBEL = 1.67
-#: clip peaks to the median plus this many standard deviations (by the median absolute deviation):
-#: larger ones are contacts, or rare postures in which an arm has large external torques
+#: Clip peaks that are further above the median than this many standard deviations (as estimated by
+#: the median absolute deviation). They may be contacts from before the threshold was known.
 OUTLYING = 6.0
 
 
@@ -124,12 +124,13 @@ def rare_peak(peaks: Array) -> float:
 
     The result is ∞ if there are too few peaks.
 
-    Rare postures and sudden reversals of friction make single torques much larger than usual, and
-    more so on some arms than on others. Therefore, each arm has a threshold of its own.
+    The external torque of a healthy arm is sometimes estimated much larger than usual, in rare
+    postures or when friction suddenly reverses. How much larger differs between arms, so each arm
+    has a threshold of its own.
 
     Args:
-        peaks: The largest d in each period of 10 s of motion, (N,). A minority of the periods may
-            contain contacts.
+        peaks: The largest d in each period of 10 s of motion, (N,). Less than half of the periods
+            may contain contacts.
     """
     if len(peaks) < LEAST_PEAKS:
         return np.inf

@@ -57,7 +57,8 @@ def test_the_recorded_arm_lost_a_muscle_moved_on_and_used_it_again():
     ended = at[next(n for n, body in enumerate(bodies) if body.anomaly is Anomaly.ENDED)]
     assert lost < ended < used_again
     times, states = series(bag, '/muscle_states')
-    tension = np.array([message.data[10 + muscle] for message in states])  # [N]
+    # The ten tensions [N] follow the ten lengths.
+    tension = np.array([message.data[10 + muscle] for message in states])
     assert (tension[(times > lost) & (times < ended)] < 3.0).all()
     assert tension[times > used_again].max() > 100.0
     (sent,), (target,) = series(bag, '/target_joint_states')

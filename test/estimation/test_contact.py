@@ -21,7 +21,7 @@ ARM = Robot.load('musashi_left_arm')
 THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])
 DT = 0.01
 SPREAD = np.full(5, 0.2)
-PEAKS = 4.0 + np.tile([-0.8, -0.3, 0.0, 0.5, 1.4], 6)  # contacts are detected from d = 9 on
+PEAKS = 4.0 + np.tile([-0.8, -0.3, 0.0, 0.5, 1.4], 6)  # the threshold is then 9.1
 
 
 def observer(spread=SPREAD, time=LEAST_MOTION, robot=ARM):
@@ -220,14 +220,14 @@ def test_each_arm_has_the_threshold_that_its_healthy_motion_requires(mae):
 
         assert move(9.0 * LEAST_PEAKS, healthy) == np.inf
         usual = move(600.0, healthy)
-        largest = max(healthy() for _ in range(36_000))  # in an hour
+        largest = max(healthy() for _ in range(36_000))  # an hour with ten messages a second
         assert largest < usual < 2.0 * largest
         restarted = HealthyTorque(ARM)
         restarted.put_into(core.put_into(known))
         assert restarted.threshold == core.threshold == usual
 
 
-def test_pushes_do_not_raise_the_threshold_unless_they_do_not_end(mae):
+def test_pushes_raise_the_threshold_only_if_they_never_end(mae):
     """In the experiment `motion`, pushes at rest made later collisions invisible."""
     known = replace(mae, touch=TouchStatistics(np.zeros(10), SPREAD, LEAST_MOTION))
     core, rng = HealthyTorque(ARM), np.random.default_rng(0)
